@@ -1,0 +1,1 @@
+"""Synthetic cases whose truth comes from other physics than the product solves."""

@@ -1,0 +1,1 @@
+"""Lung mechanics: tetrahedra, steady poroelasticity with air evacuation, contact and fit."""

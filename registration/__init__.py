@@ -1,0 +1,1 @@
+"""Image registration for chest images: rigid spine, free-form deformation, sliding and inversion."""

@@ -1,0 +1,1 @@
+"""Finding a lung nodule in the collapsed lung: formats, workflow, evaluation, report and command line."""
