@@ -1,0 +1,302 @@
+"""A case in memory: three images, the nodule, the side and the setup, checked as far as headers and voxels allow.
+
+All images leave this module with voxel axes in one order (LPS, as axial DICOM slices are stored), so that later stages
+need no thought about storage; `Case.stored_axes` remembers the order of the files, for writing results on their grids.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy import ndimage
+
+from registration.resample import resample_mask
+from registration.volume import Array, Grid, Mask, Volume, axis_codes
+from vatsloc.errors import CaseError, InputRefused
+from vatsloc.formats.casefile import CaseFile, Triple, read_case_file
+from vatsloc.formats.images import files_behind, read_mask, read_volume
+from vatsloc.formats.markups import PointList, read_points
+from vatsloc.formats.meshes import Surface, read_surface
+from vatsloc.frames import reorient
+
+AXES = "LPS"
+MIN_OVERLAP = 0.2
+"""Share of the smaller image's box that must lie inside the other; headers promise poses within about 10 cm."""
+MAX_AIR_HU = -500.0
+"""The lowest percent of voxels of a chest image in HU is air, far below this."""
+MAX_POINT_TO_MASK_MM = 10.0
+MAX_SPECK_SHARE = 0.1
+MIN_SURFACE_INSIDE = 0.9
+
+
+@dataclass(frozen=True)
+class Nodule:
+    """The target in the CT. centre_ras: (3,) mm; mask: on the CT's grid, or None when only a point is known."""
+
+    centre_ras: Array
+    mask: Mask | None
+
+
+@dataclass(frozen=True)
+class Hints:
+    """Optional help by hand, None where absent. Points (3,) RAS mm; lung_mask_ct: on the CT's grid."""
+
+    spine_ct_ras: Array | None = None
+    spine_cbct_inflated_ras: Array | None = None
+    lung_mask_ct: Mask | None = None
+    deflated_surface: Surface | None = None
+
+
+@dataclass(frozen=True)
+class Case:
+    """Everything `localize` may know.
+
+    side: "right" or "left"; gravity_ras: unit (3,) in the CBCT's frame; pleural_gas: "air" or "co2"; input_sha256 and
+    stored_axes: by name of the input; warnings: sentences for the report.
+    """
+
+    folder: Path
+    side: str
+    ct: Volume
+    cbct_inflated: Volume
+    cbct_deflated: Volume
+    nodule: Nodule
+    gravity_ras: Array
+    pleural_gas: str
+    hints: Hints
+    input_sha256: Mapping[str, str]
+    stored_axes: Mapping[str, str]
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Landmarks:
+    """What only `evaluate` may know, None where absent: landmarks by image, true nodule centres (3,) RAS mm."""
+
+    ct: PointList | None
+    cbct_inflated: PointList | None
+    cbct_deflated: PointList | None
+    nodule_inflated_ras: Array | None
+    nodule_deflated_ras: Array | None
+
+
+def read_case(folder: Path) -> Case:
+    """The case of a folder, without its landmarks and its truth.
+
+    Raises CaseError for a wrong case file, InputRefused for inputs that cannot be trusted or do not belong together.
+    """
+    file = read_case_file(folder)
+    paths = _input_paths(folder, file)
+    gravity = _gravity(file.side, file.setup.gravity_cbct)
+    with ThreadPoolExecutor(max_workers=2) as pool:  # decompression and hashing release the interpreter lock
+        images = pool.map(_read_image, (paths["ct"], paths["cbct_inflated"], paths["cbct_deflated"]))
+        digests = pool.map(sha256, paths.values())
+        (ct, ct_axes), (inflated, inflated_axes), (deflated, deflated_axes) = images
+        input_sha256 = dict(zip(paths, digests, strict=True))
+    for name in ("cbct_inflated", "cbct_deflated"):
+        _check_overlap(ct.grid, (inflated if name == "cbct_inflated" else deflated).grid, paths["ct"], paths[name])
+    _check_overlap(inflated.grid, deflated.grid, paths["cbct_inflated"], paths["cbct_deflated"])
+    warnings: list[str] = []
+    return Case(
+        folder=folder,
+        side=file.side,
+        ct=ct,
+        cbct_inflated=inflated,
+        cbct_deflated=deflated,
+        nodule=_nodule(paths, ct.grid, warnings),
+        gravity_ras=gravity,
+        pleural_gas=file.setup.pleural_gas,
+        hints=_hints(file, paths, (ct.grid, inflated.grid, deflated.grid), warnings),
+        input_sha256=input_sha256,
+        stored_axes={"ct": ct_axes, "cbct_inflated": inflated_axes, "cbct_deflated": deflated_axes},
+        warnings=tuple(warnings),
+    )
+
+
+def read_landmarks(folder: Path) -> Landmarks:
+    """Landmarks and true nodule positions, by case.toml or else by their usual names; absent ones are None.
+
+    Raises CaseError when a file that case.toml names is not there, InputRefused when one cannot be trusted.
+    """
+    named = read_case_file(folder).landmarks
+    lists = {
+        image: _points_or_none(folder, getattr(named, image), f"landmarks_{image}.mrk.json")
+        for image in ("ct", "cbct_inflated", "cbct_deflated")
+    }
+    truth = {image: folder / "truth" / f"nodule_{image}.mrk.json" for image in ("cbct_inflated", "cbct_deflated")}
+    nodule = {image: _one_point(path) if path.exists() else None for image, path in truth.items()}
+    return Landmarks(**lists, nodule_inflated_ras=nodule["cbct_inflated"], nodule_deflated_ras=nodule["cbct_deflated"])
+
+
+def sha256(path: Path) -> str:
+    """Digest of a file, or of the digests of all files that an image path stands for."""
+    digests = []
+    for file in files_behind(path):
+        with file.open("rb") as stream:
+            digests.append(hashlib.file_digest(stream, "sha256").hexdigest())
+    return digests[0] if len(digests) == 1 else hashlib.sha256("".join(digests).encode()).hexdigest()
+
+
+def _input_paths(folder: Path, file: CaseFile) -> dict[str, Path]:
+    names = {
+        "ct": file.images.ct,
+        "cbct_inflated": file.images.cbct_inflated,
+        "cbct_deflated": file.images.cbct_deflated,
+        "nodule_mask": file.nodule.mask,
+        "nodule_point": file.nodule.point,
+        "lung_mask_ct": file.hints.lung_mask_ct,
+        "deflated_surface": file.hints.deflated_surface,
+    }
+    paths = {key: folder / name for key, name in names.items() if name is not None}
+    for key, path in paths.items():
+        if not path.exists():
+            raise CaseError(f"{path} ({key} in case.toml) does not exist; put it there or correct case.toml.")
+    return paths
+
+
+def _gravity(side: str, stated: Triple | None) -> Array:
+    """Unit vector in RAS; by default from the operated side, which lies up, to the other one."""
+    default = np.array([-1.0, 0.0, 0.0]) if side == "right" else np.array([1.0, 0.0, 0.0])
+    if stated is None:
+        return default
+    gravity = np.array(stated) / np.linalg.norm(stated)
+    if gravity @ default < -0.5:
+        raise CaseError(
+            f"gravity_cbct = {list(stated)} points to the {side} side, but the operated {side} lung lies up; "
+            "correct side or the sign of gravity_cbct in case.toml."
+        )
+    return gravity
+
+
+def _read_image(path: Path) -> tuple[Volume, str]:
+    volume = read_volume(path)
+    lowest = float(np.percentile(volume.hu[::4, ::4, ::4], 1))
+    if lowest > MAX_AIR_HU:
+        raise InputRefused(
+            f"{path} shows no air (its lowest percent starts at {lowest:.0f}), so it is no chest image in HU; "
+            "export it with its rescale to HU."
+        )
+    hu, ras_from_ijk = reorient(volume.hu, volume.ras_from_ijk, AXES)
+    return Volume(np.ascontiguousarray(hu), ras_from_ijk), axis_codes(volume.ras_from_ijk)
+
+
+def _check_overlap(a: Grid, b: Grid, path_a: Path, path_b: Path) -> None:
+    share = max(_share_inside(a, b), _share_inside(b, a))
+    if share < MIN_OVERLAP:
+        centres = [grid.to_ras((np.array(grid.shape) - 1) / 2) for grid in (a, b)]
+        apart = float(np.linalg.norm(centres[0] - centres[1]))
+        raise InputRefused(
+            f"{path_a} and {path_b} overlap by {100 * share:.0f} % ({apart:.0f} mm between centres), "
+            f"{100 * MIN_OVERLAP:.0f} % needed; place them within about 10 cm of each other by their headers."
+        )
+
+
+def _share_inside(a: Grid, b: Grid) -> float:
+    """Share of a's box that lies inside b's."""
+    fractions = (np.arange(16) + 0.5) / 16
+    ijk = np.stack(np.meshgrid(*(fractions * n - 0.5 for n in a.shape), indexing="ij"), axis=-1)
+    return float(_inside(b, a.to_ras(ijk)).mean())
+
+
+def _inside(grid: Grid, points_ras: Array) -> Array:
+    ijk = grid.to_ijk(points_ras)
+    return np.asarray(((ijk >= -0.5) & (ijk <= np.array(grid.shape) - 0.5)).all(axis=-1))
+
+
+def _nodule(paths: Mapping[str, Path], ct: Grid, warnings: list[str]) -> Nodule:
+    mask = centre = None
+    if "nodule_mask" in paths:
+        mask = _largest_part(_mask_on(paths["nodule_mask"], ct), paths["nodule_mask"], warnings)
+        centre = ct.to_ras(np.argwhere(mask.inside).mean(axis=0))
+    if "nodule_point" in paths:
+        point = _one_point(paths["nodule_point"])
+        if not _inside(ct, point):
+            raise InputRefused(f"{paths['nodule_point']} lies outside the CT; save the point in the CT's frame.")
+        if mask is not None:
+            apart = np.linalg.norm(ct.to_ras(np.argwhere(mask.inside)) - point, axis=1).min()
+            if apart > MAX_POINT_TO_MASK_MM:
+                raise InputRefused(
+                    f"{paths['nodule_point']} lies {apart:.0f} mm off the nodule mask {paths['nodule_mask'].name}; "
+                    "keep the right one of the two."
+                )
+        centre = point
+    assert centre is not None  # the case file names at least one of them
+    return Nodule(centre, mask)
+
+
+def _mask_on(path: Path, grid: Grid) -> Mask:
+    """Mask of a file on the CT's grid."""
+    mask = read_mask(path)
+    inside, ras_from_ijk = reorient(mask.inside, mask.ras_from_ijk, AXES)
+    mask = Mask(np.ascontiguousarray(inside), ras_from_ijk)
+    if not _inside(grid, mask.grid.to_ras(np.argwhere(mask.inside).mean(axis=0))):
+        raise InputRefused(f"{path} lies outside the CT; draw the mask in the CT's frame.")
+    if not mask.grid.same_as(grid):
+        mask = resample_mask(mask, grid)
+        if not mask.inside.any():
+            raise InputRefused(
+                f"{path} is finer than the CT's voxels and falls between them; draw it on the CT's grid."
+            )
+    return mask
+
+
+def _largest_part(mask: Mask, path: Path, warnings: list[str]) -> Mask:
+    """The connected part that is the nodule; specks are dropped with a warning, a second nodule is refused."""
+    labels, n = ndimage.label(mask.inside, structure=np.ones((3, 3, 3)))
+    if n == 1:
+        return mask
+    sizes = np.bincount(labels.ravel())[1:]
+    largest = int(np.argmax(sizes))
+    others = int(sizes.sum() - sizes[largest])
+    if others > MAX_SPECK_SHARE * sizes[largest]:
+        raise InputRefused(
+            f"{path} shows {n} separate regions, the largest of {sizes[largest]} voxels and {others} in others; "
+            "keep one nodule per case."
+        )
+    warnings.append(f"{path.name}: {others} voxels apart from the nodule were left out.")
+    return Mask(labels == largest + 1, mask.ras_from_ijk)
+
+
+def _hints(file: CaseFile, paths: Mapping[str, Path], grids: tuple[Grid, Grid, Grid], warnings: list[str]) -> Hints:
+    ct, inflated, deflated = grids
+    spines: list[Array | None] = []
+    for key, point, grid in (
+        ("spine_ct", file.hints.spine_ct, ct),
+        ("spine_cbct_inflated", file.hints.spine_cbct_inflated, inflated),
+    ):
+        if point is not None and not _inside(grid, np.array(point)):
+            raise CaseError(
+                f"{key} = {list(point)} in case.toml lies outside its image; give RAS millimetres inside it."
+            )
+        spines.append(None if point is None else np.array(point))
+    lung = _mask_on(paths["lung_mask_ct"], ct) if "lung_mask_ct" in paths else None
+    surface = None
+    if "deflated_surface" in paths:
+        surface = read_surface(paths["deflated_surface"])
+        share = float(_inside(deflated, surface.points_ras).mean())
+        if share < MIN_SURFACE_INSIDE:
+            raise InputRefused(
+                f"{paths['deflated_surface']} has {100 * share:.0f} % of its points inside the deflated CBCT, "
+                f"{100 * MIN_SURFACE_INSIDE:.0f} % needed; save it in LPS millimetres of that image."
+            )
+        if not surface.frame_stated:
+            warnings.append(f"{paths['deflated_surface'].name} states no frame; LPS was taken.")
+    return Hints(spines[0], spines[1], lung, surface)
+
+
+def _points_or_none(folder: Path, named: str | None, usual: str) -> PointList | None:
+    if named is not None:
+        return read_points(folder / named)
+    return read_points(folder / usual) if (folder / usual).exists() else None
+
+
+def _one_point(path: Path) -> Array:
+    points = read_points(path)
+    if len(points) != 1:
+        raise InputRefused(f"{path} holds {len(points)} points, one needed; keep the nodule's centre.")
+    return points.ras[0]

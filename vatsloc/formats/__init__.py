@@ -1,0 +1,1 @@
+"""Files to arrays in RAS mm and back: images, masks, markups, transforms, displacement fields and meshes."""
