@@ -1,0 +1,205 @@
+"""Cone-beam CT made fit for measuring: its field of view, its bad end slices, and its cupping taken away."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+from registration.volume import Array, Mask, Volume
+from vatsloc.errors import InputRefused
+
+END_SLICES_MM = 12.0
+KNOT_STEP = 0.2
+SOFT_TISSUE_HU = 40.0
+
+
+@dataclass(frozen=True)
+class FieldOfView:
+    """What the scanner saw. mask: inside the cylinder; usable: that without the bad end slices, on the image's grid.
+
+    centre_ij: (2,) of the axis in in-plane voxels; radius_mm: inf where the image has no rim; axis: voxel axis along it.
+    """
+
+    mask: Mask
+    usable: Mask
+    centre_ij: Array
+    radius_mm: float
+    axis: int
+
+
+@dataclass(frozen=True)
+class Cupping:
+    """Circularly symmetric error of a CBCT, piece-wise linear in the radius.
+
+    radius_mm, hu: (m,) knots of what was subtracted; before, after: HU of "air", "lung" and "soft" tissue.
+    """
+
+    radius_mm: Array
+    hu: Array
+    before: dict[str, float]
+    after: dict[str, float]
+
+    def at(self, radius_mm: Array) -> Array:
+        """HU that the artefact adds at a distance from the axis in mm."""
+        return np.interp(radius_mm, self.radius_mm, self.hu)
+
+
+@dataclass(frozen=True)
+class PreparedCbct:
+    """CBCT ready for registration. volume: corrected, -1000 HU outside; field: what was seen; removed: the artefact."""
+
+    volume: Volume
+    field: FieldOfView
+    removed: Cupping
+
+
+def prepare_cbct(cbct: Volume) -> PreparedCbct:
+    """Field of view, bad end slices and cupping of `cbct`, and the corrected image. Ref: Alvarez 2021, section 5."""
+    field = field_of_view(cbct)
+    radius = _radius_map(cbct, field)
+    removed = estimate_cupping(cbct, field, radius)
+    hu = cbct.hu - removed.at(radius).astype(np.float32)
+    hu = np.where(field.mask.inside, np.maximum(hu, -1024), np.float32(-1000)).astype(np.float32)
+    corrected = Volume(hu, cbct.ras_from_ijk)
+    after = tissue_hu(hu[field.usable.inside])
+    return PreparedCbct(corrected, field, Cupping(removed.radius_mm, removed.hu, removed.before, after))
+
+
+def field_of_view(cbct: Volume, end_slices_mm: float = END_SLICES_MM) -> FieldOfView:
+    """The cylinder in which the image is not constant; its axis is the voxel axis nearest to the patient's S."""
+    axis = int(np.argmax(np.abs(cbct.grid.ras_from_ijk[2, :3]) / cbct.grid.spacing))
+    plane = [m for m in range(3) if m != axis]
+    sx, sy = cbct.grid.spacing[plane]
+    hu = np.moveaxis(cbct.hu, axis, 2)
+    inside, centre, radius = _disc(hu, sx, sy)
+    steps = hu.shape[2]
+    lit = inside[:, :, None] & _lit_slices(hu, inside)[None, None, :]
+    ends = int(np.ceil(end_slices_mm / cbct.grid.spacing[axis] - 1e-6))
+    found = np.flatnonzero(lit.any(axis=(0, 1)))
+    if found.size <= 2 * ends:
+        raise InputRefused(
+            f"The CBCT has {found.size} slices with content, {2 * ends + 1} needed; give the whole reconstruction."
+        )
+    good = np.zeros(steps, dtype=bool)
+    good[found[0] + ends : found[-1] - ends + 1] = True
+    mask = Mask(np.moveaxis(lit, 2, axis), cbct.ras_from_ijk)
+    rim = _disc_of(hu.shape[:2], centre, radius - 2 * max(sx, sy), sx, sy) & inside
+    usable = np.moveaxis(lit & rim[:, :, None] & good[None, None, :], 2, axis)
+    return FieldOfView(mask, Mask(usable, cbct.ras_from_ijk), centre, radius, axis)
+
+
+def _disc(hu: Array, sx: float, sy: float) -> tuple[Array, Array, float]:
+    """In-plane region that is not constant along the axis, the centre of its circle in voxels, and its radius in mm."""
+    sample = hu[:, :, :: max(hu.shape[2] // 40, 1)]
+    constant = sample.max(axis=2) == sample.min(axis=2)
+    labels, count = ndimage.label(constant)
+    corner = np.zeros(count + 1, dtype=bool)
+    corner[[labels[0, 0], labels[0, -1], labels[-1, 0], labels[-1, -1]]] = True
+    corner[0] = False
+    inside = ndimage.binary_fill_holes(~corner[labels])
+    middle = (np.array(inside.shape) - 1) / 2
+    if inside.all():
+        return inside, middle, np.inf
+    if not inside.any():
+        raise InputRefused("The CBCT is constant everywhere; give an image with content.")
+    edge = inside & ~ndimage.binary_erosion(inside, border_value=1)
+    i, j = np.nonzero(edge)
+    x, y = i * sx, j * sy
+    a = np.column_stack([2 * x, 2 * y, np.ones(len(x))])
+    cx, cy, c = np.linalg.lstsq(a, x**2 + y**2, rcond=None)[0]
+    radius = float(np.sqrt(c + cx**2 + cy**2)) + 0.5 * (sx + sy) / 2
+    misfit = np.abs(np.hypot(x - cx, y - cy) - radius)
+    if np.percentile(misfit, 90) > 4 * max(sx, sy):
+        return inside, middle, np.inf
+    return inside, np.array([cx / sx, cy / sy]), radius
+
+
+def _disc_of(shape: tuple[int, ...], centre: Array, radius: float, sx: float, sy: float) -> Array:
+    i, j = np.ogrid[: shape[0], : shape[1]]
+    return np.hypot((i - centre[0]) * sx, (j - centre[1]) * sy) <= radius
+
+
+def _lit_slices(hu: Array, inside: Array) -> Array:
+    """Slices that hold more than a constant."""
+    values = hu[inside][:: max(int(inside.sum()) // 2000, 1)]
+    return values.max(axis=0) - values.min(axis=0) > 1.0
+
+
+def _radius_map(cbct: Volume, field: FieldOfView) -> Array:
+    """Distance of every voxel from the axis in mm, broadcastable to the image."""
+    plane = [m for m in range(3) if m != field.axis]
+    n0, n1 = (cbct.hu.shape[m] for m in plane)
+    s0, s1 = cbct.grid.spacing[plane]
+    i, j = np.ogrid[:n0, :n1]
+    return np.expand_dims(np.hypot((i - field.centre_ij[0]) * s0, (j - field.centre_ij[1]) * s1), field.axis)
+
+
+def estimate_cupping(cbct: Volume, field: FieldOfView, radius: Array) -> Cupping:
+    """Radial error of soft tissue: the ridge of its HU histogram over the radius, followed from ring to ring.
+
+    The profile is zero where soft tissue reads 40 HU, so that it also carries a constant offset.
+    """
+    usable = field.usable.inside
+    hu = ndimage.uniform_filter(cbct.hu, 3)[usable][::3]
+    r = np.broadcast_to(radius, usable.shape)[usable][::3]
+    outer = float(r.max())
+    before = tissue_hu(cbct.hu[usable][::3])
+    rings = np.linspace(0.0, outer, 31)
+    levels = np.arange(-200.0, 241.0, 8.0)
+    table = np.histogram2d(r, hu, bins=(rings, levels))[0]
+    table = ndimage.gaussian_filter(table, (0.7, 1.5))
+    weight = table.sum(axis=1)
+    score = (
+        np.sqrt(table / np.maximum(table.max(axis=1, keepdims=True), 1.0)) * np.minimum(weight / 200.0, 1.0)[:, None]
+    )
+    ridge = _ridge(score, steepest=4) * 8.0 + levels[0] + 4.0
+    centres = (rings[:-1] + rings[1:]) / 2
+    knots = np.linspace(0.0, outer, round(1 / KNOT_STEP) + 1)
+    fitted = _piecewise_linear(centres, ridge - SOFT_TISSUE_HU, np.sqrt(weight), knots)
+    return Cupping(knots, fitted, before, before)
+
+
+def _ridge(score: Array, steepest: int) -> Array:
+    """Column index per row along the path of greatest total score that moves at most `steepest` columns per row."""
+    best, trail = score[0], [score[0]]
+    cost = 0.05 * np.abs(np.arange(-steepest, steepest + 1))
+    for row in score[1:]:
+        padded = np.pad(best, steepest, constant_values=-np.inf)
+        options = np.stack([padded[s : s + best.size] - cost[s] for s in range(2 * steepest + 1)])
+        best = options.max(axis=0) + row
+        trail.append(best)
+    path = [int(trail[-1].argmax())]
+    for values in reversed(trail[:-1]):
+        lo = max(path[-1] - steepest, 0)
+        window = values[lo : path[-1] + steepest + 1]
+        path.append(lo + int((window - 0.05 * np.abs(np.arange(lo, lo + window.size) - path[-1])).argmax()))
+    return np.array(path[::-1], dtype=float)
+
+
+def _piecewise_linear(x: Array, y: Array, weight: Array, knots: Array) -> Array:
+    """Values at `knots` whose piece-wise linear interpolant fits y(x) best, with bent knots slightly penalized."""
+    hats = np.stack([np.interp(x, knots, np.eye(len(knots))[m]) for m in range(len(knots))], axis=1)
+    w = weight / max(float(weight.max()), 1e-9)
+    values = np.linalg.lstsq(hats * w[:, None], y * w, rcond=None)[0]
+    for _ in range(10):
+        misfit = np.abs(hats @ values - y)
+        robust = w / np.maximum(1.0, misfit / 12.0)
+        second = 0.1 * np.diff(np.eye(len(knots)), 2, axis=0)
+        a = np.vstack([hats * robust[:, None], second])
+        values = np.linalg.lstsq(a, np.concatenate([y * robust, np.zeros(len(second))]), rcond=None)[0]
+    return values
+
+
+def tissue_hu(hu: Array) -> dict[str, float]:
+    """Histogram peaks: "air" below -880, "lung" from -880 to -500, "soft" tissue from -150 to 200 HU (nan: none)."""
+    counts, edges = np.histogram(hu, bins=np.arange(-1100.0, 300.0, 8.0))
+    smooth = ndimage.gaussian_filter1d(counts.astype(float), 1.5)
+    centre = (edges[:-1] + edges[1:]) / 2
+    out = {}
+    for name, (lo, hi) in {"air": (-1100, -880), "lung": (-880, -500), "soft": (-150, 200)}.items():
+        part = (centre >= lo) & (centre < hi)
+        top = int(np.where(part, smooth, -1).argmax())
+        out[name] = float(centre[top]) if smooth[top] > 1e-4 * hu.size else float("nan")
+    return out
