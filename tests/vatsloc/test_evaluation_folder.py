@@ -1,0 +1,204 @@
+"""A result with a known error, from a case folder and a results folder to tre.csv, tre.json and report.html."""
+
+from __future__ import annotations
+
+import csv
+import json
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from poro.mesh import stuff
+from registration.field import sample_map
+from registration.rigid import RigidTransform
+from registration.volume import Grid, Mask, Volume
+from vatsloc.errors import CaseError, InputRefused
+from vatsloc.evaluation import evaluate_case, table
+from vatsloc.formats.markups import PointList, write_points
+from vatsloc.formats.meshes import Surface, TetraMesh, write_vtu
+from vatsloc.formats.nifti import write_volume
+from vatsloc.frames import flip_points
+from vatsloc.report.render import SCORES_FROM, SCORES_TO
+from vatsloc.results import LUNG_DEFLATED, RIGID_INFLATED_FROM_CT, ResultData, RunRecord, write_results
+
+PHASE1_ERROR, PHASE2_ERROR = np.array([0.0, 1.0, 0.0]), np.array([3.0, 0.0, -4.0])
+NODULE_ERROR = np.array([2.0, 0.0, 0.0])
+STRAIN1 = np.array([[0.9, 0.05, 0], [0, 1.0, 0], [0, 0, 0.95]])
+STRAIN2 = np.array([[0.6, 0, 0], [0.1, 0.9, 0], [0, 0, 0.8]])
+CT = np.array([[x, y, z] for x in (-20.0, 10) for y in (-15.0, 15) for z in (-25.0, 0, 20)])
+NODULE = np.array([5.0, -10, 12])
+
+
+def inflated_from_ct(x):
+    return x @ STRAIN1.T + [4.0, -2, 1]
+
+
+def deflated_from_inflated(x):
+    return x @ STRAIN2.T + [-3.0, 2, 5]
+
+
+RIGID1 = RigidTransform.about(np.zeros(3), np.array([0, 0, 0.1]), np.array([4.0, -2, 1]))
+RIGID2 = RigidTransform.about(np.zeros(3), np.zeros(3), np.array([-3.0, 2, 5]))
+
+
+@pytest.fixture
+def folders(tmp_path):
+    case, result = tmp_path / "case", tmp_path / "result"
+    for folder in (case, case / "truth", result):
+        folder.mkdir()
+    grid = Grid((40, 40, 40), np.array([[3.0, 0, 0, -58], [0, 3, 0, -59], [0, 0, 3, -60], [0, 0, 0, 1]]))
+    image = Volume(np.random.default_rng(0).normal(-400, 300, grid.shape).astype(np.float32), grid.ras_from_ijk)
+    write_case(case, image)
+    write_result(result, grid, image)
+    return case, result
+
+
+def write_case(case, image):
+    names = {"ct": "ct", "inflated": "cbct_inflated", "deflated": "cbct_deflated"}
+    lines = ['side = "right"', "[images]", *(f'{name} = "{name}.nii.gz"' for name in names.values())]
+    (case / "case.toml").write_text("\n".join([*lines, "[nodule]", 'point = "nodule.mrk.json"']))
+    for name in names.values():
+        write_volume(case / f"{name}.nii.gz", image)
+    labels = tuple(f"L{n}" for n in range(len(CT)))
+    inflated = inflated_from_ct(CT) + PHASE1_ERROR
+    deflated = deflated_from_inflated(inflated) + PHASE2_ERROR
+    write_points(case / "landmarks_ct.mrk.json", PointList(CT, labels))
+    # Reversed: the label pairs the points, not their order.
+    write_points(case / "landmarks_cbct_inflated.mrk.json", PointList(inflated[::-1], labels[::-1]))
+    write_points(case / "landmarks_cbct_deflated.mrk.json", PointList(deflated[1:], labels[1:]))
+    truth = deflated_from_inflated(inflated_from_ct(NODULE)) + NODULE_ERROR
+    write_points(case / "truth" / "nodule_cbct_deflated.mrk.json", PointList(truth[None], ("nodule",)))
+
+
+def write_result(result, grid, image):
+    lung = stuff(np.linalg.norm(grid.points(), axis=-1) < 40, grid.ras_from_ijk, 12.0)
+    inflated = inflated_from_ct(lung.points)
+    deflated = deflated_from_inflated(inflated)
+    nodule = deflated_from_inflated(inflated_from_ct(NODULE))
+    surface = Surface(deflated, np.array([[0, 1, 2]]))
+    field = sample_map(inflated_from_ct, grid)
+    chain = sample_map(lambda x: deflated_from_inflated(inflated_from_ct(x)), grid)
+    details = {"nodule_ellipsoid95_axes_lps": np.eye(3)}
+    run = RunRecord(
+        "converged", flip_points(nodule), np.array([2.5, 1, 1]), {"phi": 0.5}, {"total": 1.0}, 1.0, details=details
+    )
+    meshes = [TetraMesh(points, lung.tets) for points in (lung.points, inflated, deflated)]
+    rigid = (RIGID1.matrix, RIGID2.matrix)
+    mask = Mask(grid.points()[..., 0] > 0, grid.ras_from_ijk)
+    axes = dict.fromkeys(("ct", "cbct_inflated", "cbct_deflated"), "RAS")
+    fields = (field, chain, field, chain)
+    start = inflated_from_ct(NODULE), nodule, mask, image, image
+    write_results(result, ResultData(*start, *meshes, surface, surface, *fields, *rigid, run, axes))
+    (result / "report.html").write_text(f"<p>before</p>{SCORES_FROM}{SCORES_TO}<p>after</p>")
+
+
+def test_known_errors_come_out(folders):
+    case, result = folders
+    scores = evaluate_case(case, result)
+    assert scores == json.loads((result / "tre.json").read_text())
+    assert_allclose([scores["phase1"][k] for k in ("mean", "median", "p95", "max")], 1.0, atol=2e-3)
+    assert_allclose(scores["phase1"]["sd"], 0.0, atol=2e-3)
+    assert_allclose([scores["phase2"][k] for k in ("mean", "median", "p95", "max")], 5.0, atol=2e-3)
+    chain = np.linalg.norm(STRAIN2 @ PHASE1_ERROR + PHASE2_ERROR)
+    assert_allclose(scores["chain"]["mean"], chain, atol=4e-3)
+    assert [scores[m]["n"] for m in ("phase1", "phase2", "chain")] == [12, 11, 11]
+    inflated = inflated_from_ct(CT) + PHASE1_ERROR
+    assert_allclose(
+        scores["rigid_ct_inflated"]["mean"], np.linalg.norm(RIGID1(CT) - inflated, axis=1).mean(), atol=1e-6
+    )
+    deflated = (deflated_from_inflated(inflated) + PHASE2_ERROR)[1:]
+    before = {"rigid_ct_deflated": RIGID2(RIGID1(CT))[1:], "rigid_inflated_deflated": RIGID2(inflated)[1:]}
+    for measure, predicted in before.items():
+        assert_allclose(scores[measure]["mean"], np.linalg.norm(predicted - deflated, axis=1).mean(), atol=1e-6)
+
+
+def test_nodule_error_and_ellipsoid(folders):
+    case, result = folders
+    scores = evaluate_case(case, result)
+    assert_allclose(scores["nodule_deflated_mm"], 2.0, atol=1e-6)
+    assert scores["nodule_inflated_mm"] is None
+    assert scores["nodule_in_ellipsoid95"] is True
+
+
+def test_csv_rows_agree_with_the_summary(folders):
+    case, result = folders
+    scores = evaluate_case(case, result)
+    rows = list(csv.DictReader((result / "tre.csv").read_text().splitlines()))
+    assert [row["label"] for row in rows] == [f"L{n}" for n in range(len(CT))]
+    assert rows[0]["deflated_x_ras"] == rows[0]["phase2_after_mm"] == ""
+    assert_allclose([float(rows[1][f"ct_{c}_ras"]) for c in "xyz"], CT[1])
+    assert_allclose(
+        np.mean([float(r["chain_before_mm"]) for r in rows[1:]]), scores["rigid_ct_deflated"]["mean"], atol=1e-4
+    )
+    depth = 40 - np.linalg.norm(CT, axis=1)
+    # 12 mm chords cut up to 12**2 / 40 / 3 = 1.2 mm off a sphere of 40 mm, and the mask's voxels add half of one.
+    assert_allclose([float(r["depth_mm"]) for r in rows], depth, atol=1.7)
+    assert {r["inside_mesh"] for r in rows} == {"true"}
+
+
+def test_table_shows_what_was_computed(folders):
+    text = table(evaluate_case(*folders))
+    phase2 = next(line for line in text.splitlines() if line.startswith("phase2"))
+    assert phase2.split()[1:7] == ["5.00", "0.00", "5.00", "5.00", "5.00", "11"]
+    assert "2.00 mm in the deflated one, inside its 95 % ellipsoid" in text
+
+
+def test_report_takes_the_scores_once_however_often_it_is_evaluated(folders):
+    case, result = folders
+    evaluate_case(case, result)
+    once = (result / "report.html").read_text()
+    evaluate_case(case, result)
+    assert (result / "report.html").read_text() == once
+    assert once.startswith("<p>before</p>")
+    assert once.endswith("<p>after</p>")
+    assert once.count('id="scores"') == 1
+    assert '<td class="n">5.00</td>' in once
+
+
+def test_landmarks_outside_the_field_of_view_are_named(folders):
+    case, result = folders
+    far = PointList(np.vstack([CT, [[0.0, 0, 90]]]), (*(f"L{n}" for n in range(len(CT))), "far"))
+    write_points(case / "landmarks_ct.mrk.json", far)
+    write_points(case / "landmarks_cbct_deflated.mrk.json", PointList(np.array([[0.0, 0, 80]]), ("far",)))
+    scores = evaluate_case(case, result)
+    assert [w[:20] for w in scores["warnings"]] == ["1 of 13 landmarks li"] * 3
+    row = list(csv.DictReader((result / "tre.csv").read_text().splitlines()))[-1]
+    assert (row["inside_fov"], row["inside_mesh"]) == ("false", "false")
+    assert float(row["depth_mm"]) < -40
+
+
+def test_case_without_landmarks_is_refused(folders):
+    case, result = folders
+    for path in case.glob("landmarks_cbct_*"):
+        path.unlink()
+    with pytest.raises(CaseError, match="no landmarks in the CT and a CBCT"):
+        evaluate_case(case, result)
+
+
+def test_landmarks_without_a_frame_are_refused(folders):
+    case, result = folders
+    path = case / "landmarks_ct.mrk.json"
+    path.write_text(path.read_text().replace('"coordinateSystem": "LPS",', ""))
+    with pytest.raises(InputRefused, match="states no coordinateSystem"):
+        evaluate_case(case, result)
+
+
+def test_folder_that_is_no_result_is_refused(folders, tmp_path):
+    with pytest.raises(CaseError, match="not a result of localize"):
+        evaluate_case(folders[0], tmp_path)
+
+
+def test_lungs_of_two_runs_are_not_mixed(folders):
+    case, result = folders
+    write_vtu(result / LUNG_DEFLATED, TetraMesh(np.eye(4, 3), np.array([[3, 0, 1, 2]])))
+    with pytest.raises(InputRefused, match="different tetrahedra"):
+        evaluate_case(case, result)
+
+
+def test_transform_that_is_not_rigid_is_refused(folders):
+    case, result = folders
+    path = result / RIGID_INFLATED_FROM_CT
+    path.write_text(path.read_text().replace("Parameters: 0.99", "Parameters: 1.99"))
+    with pytest.raises(InputRefused, match="no rigid transform"):
+        evaluate_case(case, result)

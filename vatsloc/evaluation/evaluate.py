@@ -1,0 +1,166 @@
+"""Scoring a result: target registration errors, depth, field of view and nodule, as tables and in the report."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from poro.mesh import locate
+from registration.volume import Array
+from vatsloc.evaluation.ellipsoid import in_ellipsoid
+from vatsloc.evaluation.inputs import Result, Truth, depth_below_pleura, read_result, read_truth, seen_in
+from vatsloc.evaluation.landmarks import LandmarkTriples
+from vatsloc.evaluation.statistics import by_depth, signed_rank_p, summarize
+from vatsloc.evaluation.tre import BEFORE, MEASURES, Errors, target_registration_errors
+from vatsloc.formats.folder import write_whole
+from vatsloc.frames import flip_points
+from vatsloc.report.data import TreSection
+from vatsloc.report.render import with_scores
+from vatsloc.results import REPORT
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Scores of one result. depth_mm: (n,) below the pleura of the CT; inside_*: (n,) bool; summary: for tre.json."""
+
+    landmarks: LandmarkTriples
+    errors: Errors
+    depth_mm: Array
+    inside_fov: Array
+    inside_mesh: Array
+    summary: dict[str, Any]
+
+
+def evaluate_case(case: Path, folder: Path) -> dict[str, Any]:
+    """Score the result in `folder` with the landmarks of `case`; writes tre.csv and tre.json and fills in report.html.
+
+    Returns what tre.json holds. Raises CaseError and InputRefused as `read_truth` and `read_result` do.
+    """
+    scores = evaluate(read_truth(case), read_result(folder))
+    write_whole(folder / "tre.csv", as_csv(scores))
+    write_whole(folder / "tre.json", json.dumps(scores.summary, indent=1, allow_nan=False) + "\n")
+    report = folder / REPORT
+    if report.is_file():
+        page = report.read_text(encoding="utf-8")
+        write_whole(report, with_scores(page, TreSection(scores.summary, scores.errors.mm)))
+    return scores.summary
+
+
+def evaluate(truth: Truth, result: Result) -> Evaluation:
+    """Errors of a result at the landmarks of a case. Ref: Alvarez 2021, section 8."""
+    landmarks = truth.landmarks
+    errors = target_registration_errors(landmarks, result.maps)
+    depth = depth_below_pleura(result.lung_ct, landmarks.ct)
+    seen = {"inflated": landmarks.inflated, "deflated": landmarks.deflated}
+    inside_fov = np.logical_and.reduce([seen_in(truth.fields_of_view[image], points) for image, points in seen.items()])
+    inside_mesh = depth >= 0
+    inflated = np.isfinite(landmarks.inflated).all(axis=1)
+    inside_mesh[inflated] &= locate(result.lung_inflated, landmarks.inflated[inflated]).inside
+    grid = result.field.grid
+    ijk = grid.to_ijk(landmarks.ct)
+    inside_field = np.all((ijk >= -0.5) & (ijk <= np.array(grid.shape) - 0.5), axis=1)
+    summary: dict[str, Any] = {m: asdict(summarize(errors.mm[m])) for m in MEASURES}
+    summary |= _nodule(truth, result)
+    summary["wilcoxon_p"] = {
+        after: signed_rank_p(errors.mm[before], errors.mm[after]) for after, before in BEFORE.items()
+    }
+    summary["inside_fov"] = {m: asdict(summarize(errors.mm[m][inside_fov])) for m in BEFORE}
+    summary["by_depth"] = {m: _strata(errors.mm[m], depth) for m in BEFORE}
+    summary["warnings"] = _warnings(landmarks, inside_fov, inside_mesh, inside_field)
+    return Evaluation(landmarks, errors, depth, inside_fov, inside_mesh, _without_nan(summary))
+
+
+def as_csv(scores: Evaluation) -> str:
+    """One row per landmark; points in RAS mm, an empty cell where a truth is missing."""
+    points = {
+        "ct": scores.landmarks.ct,
+        "inflated": scores.landmarks.inflated,
+        "deflated": scores.landmarks.deflated,
+        "predicted_inflated": scores.errors.inflated,
+        "predicted_deflated": scores.errors.deflated,
+        "predicted_deflated_from_inflated": scores.errors.deflated_from_inflated,
+    }
+    mm = scores.errors.mm
+    tre = {
+        f"{phase}_{when}_mm": mm[m]
+        for phase, rigid in BEFORE.items()
+        for when, m in (("before", rigid), ("after", phase))
+    }
+    head = [
+        "label",
+        *(f"{name}_{axis}_ras" for name in points for axis in "xyz"),
+        *tre,
+        "depth_mm",
+        "inside_fov",
+        "inside_mesh",
+    ]
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow(head)
+    for n, label in enumerate(scores.landmarks.labels):
+        numbers = [*(v for p in points.values() for v in p[n]), *(e[n] for e in tre.values()), scores.depth_mm[n]]
+        flags = [str(bool(flag[n])).lower() for flag in (scores.inside_fov, scores.inside_mesh)]
+        table.writerow([label, *("" if math.isnan(v) else f"{v:.4f}" for v in numbers), *flags])
+    return text.getvalue()
+
+
+def _nodule(truth: Truth, result: Result) -> dict[str, Any]:
+    """Distance of both predicted nodules to the truth, None where that is not known."""
+    inf, deflated = truth.nodule.nodule_inflated_ras, truth.nodule.nodule_deflated_ras
+    contained = None
+    if deflated is not None and result.run.get("nodule_ellipsoid95_mm") is not None:
+        contained = in_ellipsoid(
+            flip_points(deflated - result.nodule_deflated_ras),
+            np.array(result.run["nodule_ellipsoid95_mm"]),
+            result.run.get("nodule_ellipsoid95_axes_lps"),
+        )
+    return {
+        "nodule_inflated_mm": None if inf is None else float(np.linalg.norm(inf - result.nodule_inflated_ras)),
+        "nodule_deflated_mm": None
+        if deflated is None
+        else float(np.linalg.norm(deflated - result.nodule_deflated_ras)),
+        "nodule_in_ellipsoid95": contained,
+    }
+
+
+def _strata(errors_mm: Array, depth_mm: Array) -> list[dict[str, Any]]:
+    return [
+        {"from_mm": s.from_mm, "to_mm": s.to_mm if math.isfinite(s.to_mm) else None, **asdict(s.errors)}
+        for s in by_depth(errors_mm, depth_mm)
+    ]
+
+
+def _warnings(landmarks: LandmarkTriples, inside_fov: Array, inside_mesh: Array, inside_field: Array) -> list[str]:
+    n = len(landmarks)
+    found = [
+        (
+            len(landmarks.unmatched),
+            f"label(s) without a counterpart were left out: {', '.join(landmarks.unmatched[:5])}.",
+        ),
+        (int((~inside_fov).sum()), f"of {n} landmarks lie outside a CBCT's field of view."),
+        (
+            int((~inside_mesh).sum()),
+            f"of {n} landmarks lie outside the lung model; they move as its nearest surface point does.",
+        ),
+        (
+            int((~inside_field).sum()),
+            f"of {n} landmarks lie outside the exported field; its nearest displacement was taken.",
+        ),
+    ]
+    return [f"{count} {sentence}" for count, sentence in found if count]
+
+
+def _without_nan(value: Any) -> Any:
+    """JSON knows no NaN: null stands for a number that does not exist."""
+    if isinstance(value, dict):
+        return {k: _without_nan(v) for k, v in value.items()}
+    if isinstance(value, list):
+        return [_without_nan(v) for v in value]
+    return None if isinstance(value, float) and math.isnan(value) else value

@@ -1,0 +1,156 @@
+"""What an evaluation reads: landmarks and fields of view of the case; maps, meshes and the answer of the result."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from poro.mesh import TetMesh, closest_points, interpolate, locate
+from registration.field import DisplacementField
+from registration.rigid import RigidTransform
+from registration.volume import Array, Mask
+from vatsloc.case import Landmarks, read_landmarks
+from vatsloc.errors import CaseError, InputRefused
+from vatsloc.evaluation.landmarks import LandmarkTriples, match
+from vatsloc.evaluation.tre import RunMaps
+from vatsloc.formats.casefile import read_case_file
+from vatsloc.formats.fields import read_field
+from vatsloc.formats.folder import RUN_FILE, is_result
+from vatsloc.formats.images import read_volume
+from vatsloc.formats.markups import read_points
+from vatsloc.formats.meshes import read_vtu
+from vatsloc.formats.transforms import read_tfm
+from vatsloc.imaging.cbct import field_of_view
+from vatsloc.results import (
+    DEFLATED_FROM_CT,
+    INFLATED_FROM_CT,
+    LUNG_CT,
+    LUNG_DEFLATED,
+    LUNG_INFLATED,
+    NODULE_DEFLATED,
+    NODULE_INFLATED,
+    RIGID_DEFLATED_FROM_INFLATED,
+    RIGID_INFLATED_FROM_CT,
+    read_run,
+)
+
+
+@dataclass(frozen=True)
+class MeshMap:
+    """Where nodes that move from `mesh` to `moved` (n, 3) mm carry a point, linear in each tetrahedron.
+
+    A point outside the mesh moves as the nearest point of its surface does.
+    """
+
+    mesh: TetMesh
+    moved: Array
+
+    def __call__(self, points_ras: Array) -> Array:
+        """Moved points (q, 3) mm."""
+        displacement = self.moved - self.mesh.points
+        return np.asarray(points_ras, dtype=float) + interpolate(locate(self.mesh, points_ras), displacement)
+
+
+@dataclass(frozen=True)
+class Result:
+    """A results folder in memory. run: run.json; lung_ct: for depths; nodule_*_ras: (3,) predictions, RAS mm."""
+
+    run: dict[str, Any]
+    maps: RunMaps
+    field: DisplacementField
+    lung_ct: TetMesh
+    lung_inflated: TetMesh
+    nodule_inflated_ras: Array
+    nodule_deflated_ras: Array
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What is known about a case. fields_of_view: by CBCT, "inflated" and "deflated"."""
+
+    landmarks: LandmarkTriples
+    nodule: Landmarks
+    fields_of_view: dict[str, Mask]
+
+
+def read_truth(case: Path) -> Truth:
+    """Landmarks, true nodule and fields of view of a case folder.
+
+    Raises CaseError when the landmarks are missing or match nowhere, InputRefused when a file cannot be trusted.
+    """
+    known = read_landmarks(case)
+    if known.ct is None or (known.cbct_inflated is None and known.cbct_deflated is None):
+        raise CaseError(
+            f"{case} has no landmarks in the CT and a CBCT, so there is nothing to score; "
+            "name them under [landmarks] in case.toml."
+        )
+    triples = match(known.ct, known.cbct_inflated, known.cbct_deflated)
+    images = read_case_file(case).images
+    seen = {
+        "inflated": field_of_view(read_volume(case / images.cbct_inflated)).mask,
+        "deflated": field_of_view(read_volume(case / images.cbct_deflated)).mask,
+    }
+    return Truth(triples, known, seen)
+
+
+def read_result(folder: Path) -> Result:
+    """Maps, meshes and answer of a results folder. Raises CaseError when it is none, InputRefused when damaged."""
+    if not is_result(folder):
+        raise CaseError(
+            f"{folder} is not a result of localize (no {RUN_FILE} of vatsloc); give the folder that localize wrote."
+        )
+    ct, inflated, deflated = (read_vtu(folder / name) for name in (LUNG_CT, LUNG_INFLATED, LUNG_DEFLATED))
+    if not (np.array_equal(ct.tets, inflated.tets) and np.array_equal(inflated.tets, deflated.tets)):
+        raise InputRefused(f"the lungs in {folder} have different tetrahedra; run localize again.")
+    lung_inflated = TetMesh(inflated.points_ras, inflated.tets)
+    def_from_ct = read_field(folder / DEFLATED_FROM_CT)
+    rigid_inf_from_ct, rigid_def_from_inf = (
+        _rigid(folder / RIGID_INFLATED_FROM_CT),
+        _rigid(folder / RIGID_DEFLATED_FROM_INFLATED),
+    )
+    return Result(
+        run=read_run(folder),
+        maps=RunMaps(
+            rigid_inf_from_ct=rigid_inf_from_ct,
+            rigid_def_from_ct=rigid_def_from_inf @ rigid_inf_from_ct,
+            rigid_def_from_inf=rigid_def_from_inf,
+            inf_from_ct=read_field(folder / INFLATED_FROM_CT),
+            def_from_inf=MeshMap(lung_inflated, deflated.points_ras),
+            def_from_ct=def_from_ct,
+        ),
+        field=def_from_ct,
+        lung_ct=TetMesh(ct.points_ras, ct.tets),
+        lung_inflated=lung_inflated,
+        nodule_inflated_ras=read_points(folder / NODULE_INFLATED).ras[0],
+        nodule_deflated_ras=read_points(folder / NODULE_DEFLATED).ras[0],
+    )
+
+
+def depth_below_pleura(lung: TetMesh, points_ras: Array) -> Array:
+    """Distance (n,) mm of points (n, 3) below the lung's surface, negative outside, NaN for a missing point."""
+    depth = np.full(len(points_ras), np.nan)
+    known = np.isfinite(points_ras).all(axis=1)
+    if known.any():
+        depth[known] = -closest_points(lung.boundary, points_ras[known]).distance
+    return depth
+
+
+def seen_in(mask: Mask, points_ras: Array) -> Array:
+    """Whether points (n, 3) fall into voxels of the mask, (n,) bool; a missing point (NaN) counts as seen."""
+    missing: Array = np.any(~np.isfinite(points_ras), axis=1)
+    ijk = np.rint(mask.grid.to_ijk(np.where(missing[:, None], 0.0, points_ras))).astype(int)
+    within: Array = np.all((ijk >= 0) & (ijk < mask.inside.shape), axis=1)
+    hit = np.zeros(len(ijk), dtype=bool)
+    i, j, k = ijk[within].T
+    hit[within] = mask.inside[i, j, k]
+    return hit | missing
+
+
+def _rigid(path: Path) -> RigidTransform:
+    try:
+        return RigidTransform(read_tfm(path))
+    except ValueError as error:
+        raise InputRefused(f"{path} holds no rigid transform ({error}); run localize again.") from error

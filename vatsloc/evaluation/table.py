@@ -1,0 +1,30 @@
+"""The scores as text for a terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from vatsloc.evaluation.tre import BEFORE, MEASURES
+
+_COLUMNS = ("mean", "sd", "median", "p95", "max")
+
+
+def table(summary: Mapping[str, Any]) -> str:
+    """Table of the dict that tre.json holds: a line per measure in mm, then the nodule."""
+    lines = [f"{'TRE, mm':<26}" + "".join(f"{c:>8}" for c in _COLUMNS) + f"{'n':>6}  p, before and after"]
+    for measure in MEASURES:
+        s = summary[measure]
+        numbers = "".join(f"{_mm(s[c]):>8}" for c in _COLUMNS)
+        p = summary["wilcoxon_p"].get(measure) if measure in BEFORE else None
+        lines.append(f"{measure:<26}{numbers}{s['n']:>6}" + ("" if p is None else f"  {p:.2g}"))
+    inside = {True: ", inside its 95 % ellipsoid", False: ", outside its 95 % ellipsoid", None: ""}
+    lines.append(
+        f"nodule: {_mm(summary['nodule_inflated_mm'])} mm off in the inflated CBCT, "
+        f"{_mm(summary['nodule_deflated_mm'])} mm in the deflated one{inside[summary['nodule_in_ellipsoid95']]}"
+    )
+    return "\n".join([*lines, *(f"note: {warning}" for warning in summary["warnings"])])
+
+
+def _mm(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f}"

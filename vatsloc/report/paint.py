@@ -1,0 +1,113 @@
+"""Pixels: grey images, two-colour blends, outlines, and their encoding as data URIs. Channels are BGR, as in OpenCV."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+
+from registration.volume import Array, Mask, Volume
+from vatsloc.report.data import NODULE, Nodule, Outline, Surface
+from vatsloc.report.planes import Plane, ellipse, sample, section
+
+# Lines are drawn with sub-pixel ends: OpenCV takes integers in units of 2**-SHIFT pixel.
+SHIFT = 4
+
+
+def grey(hu: Array, window: tuple[float, float]) -> Array:
+    """Window HU to 0..255, uint8."""
+    low, high = window
+    return np.clip((hu - low) * (255.0 / (high - low)), 0, 255).astype(np.uint8)
+
+
+def green_magenta(moving: Array, fixed: Array) -> Array:
+    """Moving image in green, fixed in magenta, grey where they agree; (rows, columns) uint8 each -> BGR."""
+    return np.ascontiguousarray(np.stack([fixed, moving, fixed], axis=-1))
+
+
+def as_bgr(image: Array) -> Array:
+    """Grey (rows, columns) to BGR (rows, columns, 3)."""
+    return np.repeat(image[..., None], 3, axis=-1)
+
+
+def bgr(colour: str) -> tuple[int, int, int]:
+    """ "#rrggbb" as OpenCV wants it."""
+    r, g, b = (int(colour[m : m + 2], 16) for m in (1, 3, 5))
+    return b, g, r
+
+
+def draw_outline(image: Array, plane: Plane, outline: Outline, thickness: int = 1) -> None:
+    """Draw a surface's section or a mask's border on BGR or BGRA pixels of the plane, in place."""
+    if isinstance(outline.shape, Surface):
+        lines = list(section(outline.shape, plane))
+        closed = False
+    else:
+        lines = _borders(outline.shape, plane)
+        closed = True
+    _lines(image, lines, closed, outline.colour, thickness)
+
+
+def draw_nodule(image: Array, plane: Plane, nodule: Nodule, thickness: int = 2) -> None:
+    """Draw the 95 % ellipsoid's section, and a dot with a gapped cross where the centre is, in place."""
+    if nodule.ellipsoid is not None:
+        curve = ellipse(nodule.centre_ras, nodule.ellipsoid, plane)
+        if curve is not None:
+            _lines(image, [curve], True, NODULE, thickness)
+    away = abs(float((nodule.centre_ras - plane.origin) @ plane.normal))
+    if away > max(2.0, float(np.linalg.norm(plane.right))):
+        return
+    at = plane.to_pixels(nodule.centre_ras)
+    cv2.circle(image, _fixed_point(at), 2 << SHIFT, _colour(image, NODULE), cv2.FILLED, cv2.LINE_AA, SHIFT)
+    for direction in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+        arm = np.array(direction, dtype=float)
+        _lines(image, [np.array([at + 7 * arm, at + 14 * arm])], False, NODULE, 1)
+
+
+def layer(plane: Plane, outlines: Sequence[Outline], nodule: Nodule | None) -> Array:
+    """Outlines alone on a transparent ground, BGRA."""
+    image = np.zeros((*plane.shape, 4), dtype=np.uint8)
+    for outline in outlines:
+        draw_outline(image, plane, outline)
+    if nodule is not None:
+        draw_nodule(image, plane, nodule)
+    return image
+
+
+def jpeg(image: Array, quality: int = 82) -> str:
+    """Data URI of grey or BGR pixels."""
+    return _uri(".jpg", "image/jpeg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
+
+
+def png(image: Array) -> str:
+    """Data URI of grey, BGR or BGRA pixels, without loss."""
+    return _uri(".png", "image/png", image, [cv2.IMWRITE_PNG_COMPRESSION, 6])
+
+
+def _uri(extension: str, mime: str, image: Array, options: list[int]) -> str:
+    done, data = cv2.imencode(extension, image, options)
+    if not done:
+        raise ValueError(f"pixels of shape {image.shape}, {image.dtype} cannot be encoded as {mime}")
+    return f"data:{mime};base64,{base64.b64encode(data.tobytes()).decode()}"
+
+
+def _borders(mask: Mask, plane: Plane) -> list[Array]:
+    inside = sample(Volume(mask.inside.astype(np.float32), mask.ras_from_ijk), plane, fill=0.0) > 0.5
+    borders, _ = cv2.findContours(inside.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    return [border[:, 0, :].astype(float) for border in borders]
+
+
+def _lines(image: Array, lines: Sequence[Array], closed: bool, colour: str, thickness: int) -> None:
+    if lines:
+        points = [np.rint(np.asarray(line) * (1 << SHIFT)).astype(np.int32) for line in lines]
+        cv2.polylines(image, points, closed, _colour(image, colour), thickness, cv2.LINE_AA, SHIFT)
+
+
+def _fixed_point(at: Array) -> tuple[int, int]:
+    x, y = np.rint(at * (1 << SHIFT)).astype(int)
+    return int(x), int(y)
+
+
+def _colour(image: Array, colour: str) -> tuple[int, ...]:
+    return (*bgr(colour), 255) if image.shape[2] == 4 else bgr(colour)
