@@ -49,7 +49,7 @@ class Grid:
         return points_ijk @ self.ras_from_ijk[:3, :3].T + self.ras_from_ijk[:3, 3]
 
     def with_spacing(self, spacing_mm: float | Array) -> Grid:
-        """Grid over the same box whose voxels are `spacing_mm` wide (scalar or (3,)), first voxel's outer corner kept."""
+        """Grid over the same box with voxels `spacing_mm` wide (scalar or (3,)), first voxel's outer corner kept."""
         new = np.broadcast_to(np.asarray(spacing_mm, dtype=float), (3,))
         size = np.maximum(np.rint(np.array(self.shape) * self.spacing / new), 1).astype(int)
         ratio = new / self.spacing
@@ -121,7 +121,9 @@ class Mask(_OnGrid):
 
     def __post_init__(self) -> None:
         if self.inside.ndim != 3 or self.inside.dtype != bool:
-            raise ValueError(f"inside must be a boolean array of three axes, got {self.inside.dtype} {self.inside.shape}")
+            raise ValueError(
+                f"inside must be a boolean array of three axes, got {self.inside.dtype} {self.inside.shape}"
+            )
 
     def _values(self) -> Array:
         return self.inside
