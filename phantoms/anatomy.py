@@ -1,0 +1,166 @@
+"""Shape of a thorax drawn from a seed: body, cage, mediastinum, diaphragm and the two lungs as signed distances.
+
+Frame: RAS mm with x to the patient's right, y forward, z up, z = 0 a little below the carina.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phantoms.fields import Lattice, as_distance, lattice_over, smoothstep, soft_max
+
+Array = NDArray[Any]
+
+
+@dataclass(frozen=True)
+class Build:
+    """Measures of one person in mm. width, depth: half axes of the inner cage; apex: top of the lungs; dome: top of the
+    diaphragm, (right, left); fat: thickness under the skin, (front, side); heart: centre and half axes, (2, 3);
+    spine_bow: depth of the kyphosis; mediastinum: half width of the middle of the chest."""
+
+    width: float
+    depth: float
+    apex: float
+    dome: tuple[float, float]
+    fat: tuple[float, float]
+    heart: Array
+    spine_bow: float
+    mediastinum: float
+
+
+@dataclass(frozen=True)
+class Shapes:
+    """Signed distances (mm, negative inside) of the large organs on one lattice."""
+
+    build: Build
+    body: Lattice
+    cage: Lattice
+    right_lung: Lattice
+    left_lung: Lattice
+    heart: Lattice
+    below_diaphragm: Lattice
+
+    def lung(self, side: str) -> Lattice:
+        """The lung on `side`, "right" or "left"."""
+        return self.right_lung if side == "right" else self.left_lung
+
+
+def draw_build(rng: np.random.Generator) -> Build:
+    """Measures of a person, drawn within adult variation."""
+    size = rng.uniform(0.94, 1.05)
+    dome = -102 * size + rng.uniform(-6, 6)
+    centre = np.array([-20, 22, -66]) * size + rng.uniform(-4, 4, 3)
+    radii = np.array([50, 43, 54]) * size * rng.uniform(0.94, 1.06, 3)
+    return Build(
+        width=124 * size * rng.uniform(0.96, 1.04),
+        depth=88 * size * rng.uniform(0.96, 1.06),
+        apex=120 * size,
+        dome=(dome, dome - rng.uniform(6, 16)),
+        fat=(rng.uniform(8, 22), rng.uniform(10, 20)),
+        heart=np.stack([centre, radii]),
+        spine_bow=rng.uniform(8, 16),
+        mediastinum=rng.uniform(24, 30),
+    )
+
+
+def spine_y(build: Build, z: Array) -> Array:
+    """Front-back position of the centre of the vertebral bodies at height z: a kyphosis."""
+    return -build.depth + 27 + build.spine_bow * (1 - ((z + 20) / 120) ** 2) * -0.6
+
+
+def cage_axes(build: Build, z: Array) -> tuple[Array, Array, Array]:
+    """Half width, half depth and front-back centre of the inner cage at height z."""
+    t = np.clip((z + 70) / (build.apex + 70), 0, 0.9999)
+    half_x = build.width * (1 - t**2.7) ** 0.45
+    half_y = build.depth * (1 - t**2.6) ** 0.42
+    return half_x, half_y, -0.13 * np.maximum(z + 70, 0) * smoothstep(z, -70, 0)
+
+
+def make_shapes(build: Build, spacing: float = 3.0) -> Shapes:
+    """Organs of a person on a lattice of `spacing` mm, from below the recesses to above the apices."""
+    x_max = build.width + 26 + build.fat[1] + 14
+    lower = np.array([-x_max, -build.depth - 58, build.dome[1] - 92])
+    upper = np.array([x_max, build.depth + 34 + build.fat[0], build.apex + 16])
+    lattice = lattice_over(lower, upper, spacing)
+    x, y, z = (a.astype(np.float32) for a in lattice.axes)
+    cage = _cage(build, x, y, z)
+    heart = _heart(build, x, y, z)
+    diaphragm = _diaphragm(build, x, y, z)
+    centre = _mediastinum(build, x, y, z)
+    lungs = []
+    for sign in (1, -1):
+        phi = soft_max(cage, diaphragm, 5)
+        phi = soft_max(phi, -centre, 8)
+        phi = soft_max(phi, -heart + 1, 8)
+        lungs.append(as_distance(lattice, soft_max(phi, np.broadcast_to(1.5 - sign * x, phi.shape), 3)))
+    return Shapes(
+        build=build,
+        body=as_distance(lattice, _body(build, x, y, z)),
+        cage=as_distance(lattice, cage),
+        right_lung=lungs[0],
+        left_lung=lungs[1],
+        heart=as_distance(lattice, heart),
+        below_diaphragm=as_distance(lattice, -diaphragm),
+    )
+
+
+def _superellipse(x: Array, y: Array, half_x: Array, half_y: Array, power: float) -> Array:
+    rho = ((np.abs(x) / half_x) ** power + (np.abs(y) / half_y) ** power) ** (1 / power)
+    return (rho - 1) * np.minimum(half_x, half_y)
+
+
+def _cage(build: Build, x: Array, y: Array, z: Array) -> Array:
+    half_x, half_y, centre = cage_axes(build, z)
+    side = _superellipse(x, y - centre, half_x, half_y, 2.35)
+    top = (z - build.apex) * 0.6 + 0.012 * (np.abs(x) - 42) ** 2 * 0.6
+    return soft_max(side, np.broadcast_to(top, side.shape), 12)
+
+
+def _body(build: Build, x: Array, y: Array, z: Array) -> Array:
+    shoulder = smoothstep(z, 10, 110)
+    half_x = build.width + 26 + build.fat[1] - 3 * smoothstep(z, -60, -150) + 10 * shoulder
+    half_y = build.depth + 33 + 0.7 * build.fat[0] - 12 * shoulder
+    centre = -10 + 0.3 * build.fat[0] - 0.06 * z
+    back = 5 * np.exp(-((x / 10) ** 2)) * (y < -0.7 * build.depth)
+    return _superellipse(x, y - centre, half_x, half_y, 2.5) + back
+
+
+def _heart(build: Build, x: Array, y: Array, z: Array) -> Array:
+    c, r = build.heart
+    dx, dy, dz = x - c[0], y - c[1], z - c[2]
+    # The long axis points to the left, forward and down.
+    u = 0.80 * dx - 0.40 * dy + 0.45 * dz
+    v = 0.45 * dx + 0.89 * dy
+    w = -0.40 * dx + 0.20 * dy + 0.89 * dz
+    q = np.sqrt((u / (r[0] * 1.12)) ** 2 + (v / r[1]) ** 2 + (w / r[2]) ** 2)
+    return (q - 1) * r.min()
+
+
+def _diaphragm(build: Build, x: Array, y: Array, z: Array) -> Array:
+    """Positive below the diaphragm."""
+    to_right = smoothstep(x, -35, 30)
+    top = build.dome[1] + (build.dome[0] - build.dome[1]) * to_right
+    across = np.sqrt(((np.abs(x) - 56) / (build.width - 52)) ** 2 + ((y - 8) / (build.depth + 2)) ** 2)
+    outer = (np.abs(x) > 56) | (np.abs(y - 8) > 40)
+    drop = np.where(outer, 62, 46) * np.clip(across, 0, 1.15) ** 2.6
+    behind = 16 * smoothstep(-y, -10, build.depth)
+    surface = top - drop - behind
+    return (surface - z) * 0.75
+
+
+def _mediastinum(build: Build, x: Array, y: Array, z: Array) -> Array:
+    """Negative inside the middle of the chest: great vessels and fat, spine, descending aorta, oesophagus."""
+    m = build.mediastinum
+    half_x = m + 7 * np.exp(-(((z + 12) / 30) ** 2)) - 6 * smoothstep(z, 20, 80)
+    half_y = 56 - 22 * smoothstep(z, 20, 90)
+    middle = _superellipse(x + 3, y - 4 + 14 * smoothstep(z, 0, 100), half_x, half_y, 2.2)
+    septum = np.abs(x) - 3.0
+    spine = np.sqrt(x**2 + (y - spine_y(build, z)) ** 2) - 21
+    aorta = np.sqrt((x + 17) ** 2 + (y - spine_y(build, z) - 23) ** 2) - 12.5 + 20 * smoothstep(z, 25, 45)
+    gullet = np.sqrt((x + 3) ** 2 + (y - spine_y(build, z) - 30) ** 2) - 12
+    phi = np.minimum(np.minimum(middle, septum), np.minimum(spine, aorta))
+    return np.minimum(phi, gullet)

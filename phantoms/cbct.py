@@ -1,0 +1,67 @@
+"""A cone-beam scanner in the image domain: field of view, blur, cupping, truncation rim, noise, bad end slices."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from phantoms.fields import smoothstep
+from registration.volume import Grid, Volume
+
+Array = NDArray[Any]
+OUTSIDE_HU = -1000.0
+
+
+@dataclass(frozen=True)
+class Scanner:
+    """Cone-beam scanner. fov: mm diameter; blur: mm standard deviation; cupping: share of the signal lost in the
+    middle; rim: share gained at the edge of the field of view; noise: HU; end: mm of bad slices at either end."""
+
+    fov: float = 240.0
+    blur: float = 0.7
+    cupping: float = 0.06
+    rim: float = 0.10
+    noise: float = 28.0
+    end: float = 12.0
+
+
+def scanner_grid(centre: Array, spacing: tuple[float, float, float], length_mm: float, fov_mm: float = 240.0) -> Grid:
+    """Voxels of a field of view about `centre` (mm), axes to the left, back and top of the patient."""
+    n = [max(round(s / h), 2) for s, h in zip((fov_mm, fov_mm, length_mm), spacing, strict=True)]
+    step = np.array([-spacing[0], -spacing[1], spacing[2]])
+    affine = np.diag([*step, 1.0])
+    affine[:3, 3] = centre - step * (np.array(n) - 1) / 2
+    return Grid((n[0], n[1], n[2]), affine)
+
+
+def expose(clean: Volume, scanner: Scanner, rng: np.random.Generator) -> Volume:
+    """Image that the scanner makes of `clean` (HU, on the scanner's own grid)."""
+    grid = clean.grid
+    h = grid.spacing
+    i, j, k = ((np.arange(n) - (n - 1) / 2) * s for n, s in zip(grid.shape, h, strict=True))
+    radius = np.sqrt(i[:, None] ** 2 + j[None, :] ** 2).astype(np.float32)[:, :, None]
+    share = np.minimum(radius / (scanner.fov / 2), 1)
+    signal = ndimage.gaussian_filter(clean.hu.astype(np.float32) + 1000, scanner.blur / h)
+    signal *= (
+        1 - scanner.cupping * (1 - share**2) + scanner.rim * smoothstep(radius, 0.9 * scanner.fov / 2, scanner.fov / 2)
+    )
+    bad = smoothstep(np.abs(k), k[-1] - scanner.end, k[-1] + h[2]).astype(np.float32)[None, None, :]
+    shade = ndimage.uniform_filter1d(signal, max(int(10 / h[0]), 1), axis=0)
+    signal += bad * (0.8 * shade + 20 - signal)
+    signal += _grain(grid, rng) * scanner.noise * (1.15 - 0.45 * share**2) * (1 + 1.5 * bad)
+    hu = signal - 1000
+    hu = np.where(radius <= scanner.fov / 2, np.clip(hu, -1024, 3071), OUTSIDE_HU)
+    return Volume(np.ascontiguousarray(hu, dtype=np.float32), clean.ras_from_ijk)
+
+
+def _grain(grid: Grid, rng: np.random.Generator) -> Array:
+    """Noise of unit variance, finer across the slices than along, with a weak coarse part."""
+    white = rng.standard_normal(grid.shape, dtype=np.float32)
+    fine = ndimage.gaussian_filter(white, 0.75 / grid.spacing, truncate=3)
+    small = rng.standard_normal([n // 6 + 2 for n in grid.shape]).astype(np.float32)
+    coarse = ndimage.zoom(small, 6, order=1)[: grid.shape[0], : grid.shape[1], : grid.shape[2]]
+    return 0.95 * fine / fine.std() + 0.3 * coarse / coarse.std()

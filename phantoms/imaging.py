@@ -1,0 +1,158 @@
+"""Noise-free images of a thorax in a state: walls carried by the cage's motion, lung by its own map."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.spatial import cKDTree
+
+from phantoms.cage import CageMotion
+from phantoms.fields import Lattice, coverage, refine, smoothstep
+from phantoms.spline import SplineMap, determinant
+from phantoms.thorax import NODULE_HU, LungTrees, Nodule, Thorax, draw_lung_trees
+from registration.volume import Grid, Mask, Volume
+
+Array = NDArray[Any]
+PLEURAL_AIR_HU = -998.0
+
+
+@dataclass(frozen=True)
+class State:
+    """A thorax on the table. lung: operated lung in the CT; cavity: its room in the state, both signed distances (mm);
+    motion: CT to the state for the walls; lung_map: CT to the state for the operated lung; held: whether the lung fills
+    its room; pose: (4, 4), frame of the state's image from that of the CT; samples: (n, 3) mm in the lung in the CT."""
+
+    lung: Lattice
+    cavity: Lattice
+    motion: CageMotion
+    lung_map: SplineMap
+    held: bool
+    pose: Array
+    samples: Array
+
+    def from_ct(self, points: Array) -> Array:
+        """Where lung tissue at CT points (n, 3) is in the state's image frame, RAS mm."""
+        return self.posed(self.lung_map(points))
+
+    def to_ct(self, points: Array) -> tuple[Array, Array]:
+        """CT points (n, 3) of lung tissue at points (n, 3) of the state's image frame, and what is left, (n,) mm."""
+        return self.lung_map.inverse(self.unposed(points), self.samples)
+
+    def posed(self, points: Array) -> Array:
+        """Points (n, 3) of the CT's frame in the state's image frame."""
+        return points @ self.pose[:3, :3].T + self.pose[:3, 3]
+
+    def unposed(self, points: Array) -> Array:
+        """Points (n, 3) of the state's image frame in the CT's frame."""
+        return (points - self.pose[:3, 3]) @ self.pose[:3, :3]
+
+
+@dataclass(frozen=True)
+class Picture:
+    """Noise-free image of a state with masks of the operated lung and of the nodule."""
+
+    clean: Volume
+    lung: Mask
+    nodule: Mask
+
+
+def image_state(thorax: Thorax, body: Volume, state: State, grid: Grid) -> Picture:
+    """Image of a state on `grid`. body: the CT without its operated lung (HU)."""
+    width = float(grid.spacing.mean())
+    x = np.stack([a.ravel() for a in np.moveaxis(state_points(state, grid), -1, 0)], axis=1)
+    hu = _walls(body, state, grid)
+    room = coverage(state.cavity.sample(x), width)
+    within = np.flatnonzero(room > 0)
+    source, ratio = _lung_sources(state, grid, within)
+    del x
+    edge = state.lung.sample(source) * np.cbrt(ratio)
+    share = np.ones_like(edge) if state.held else coverage(edge, width)
+    tissue = np.minimum((thorax.parenchyma.sample(source) + 1000) / ratio - 1000, 40.0)
+    lesion = coverage(thorax.nodule.distance(source) * np.cbrt(ratio), width) * share
+    tissue += lesion * (NODULE_HU - tissue)
+    inner = PLEURAL_AIR_HU + share * (tissue - PLEURAL_AIR_HU)
+    flat = hu.ravel()
+    flat[within] += room[within] * (inner - flat[within])
+    trees = carry_trees(thorax.trees[thorax.index(thorax.side)], state)
+    plain = flat[within].copy()
+    draw_lung_trees(hu, trees, grid, width)
+    flat[within] += lesion * room[within] * (plain - flat[within])
+    lung, nodule = np.zeros(hu.size, dtype=bool), np.zeros(hu.size, dtype=bool)
+    lung[within] = (share > 0.5) & (room[within] > 0.5)
+    nodule[within] = lesion > 0.5
+    affine = grid.ras_from_ijk
+    return Picture(Volume(hu, affine), Mask(lung.reshape(grid.shape), affine), Mask(nodule.reshape(grid.shape), affine))
+
+
+def state_points(state: State, grid: Grid) -> Array:
+    """Voxel centres in the frame of the CT, mm, (ni, nj, nk, 3)."""
+    affine = np.linalg.inv(state.pose) @ grid.ras_from_ijk
+    return Grid(grid.shape, affine).points().astype(np.float32)
+
+
+def carry_trees(trees: LungTrees, state: State) -> LungTrees:
+    """Trees of the operated lung in the state's image frame; what lies in the mediastinum moves with it."""
+    moved = []
+    for tree in (trees.airway, trees.artery, trees.vein):
+        outside = smoothstep(state.lung.at(tree.nodes), 0, 12)[:, None]
+        inside = state.lung_map(tree.nodes)
+        moved.append(tree.moved(state.posed(inside + outside * (state.motion(tree.nodes) - inside))))
+    return LungTrees(*moved)
+
+
+def nodule_mask(nodule: Nodule, grid: Grid) -> Mask:
+    """Voxels of the CT whose centres lie in the nodule."""
+    inside = np.zeros(grid.shape, dtype=bool)
+    reach = nodule.radius + nodule.relief + 2 * grid.spacing.max()
+    corners = grid.to_ijk(
+        nodule.centre + reach * np.array([[a, b, c] for a in (-1, 1) for b in (-1, 1) for c in (-1, 1)])
+    )
+    lo = np.maximum(np.floor(corners.min(axis=0)), 0).astype(int)
+    sub = grid.box(lo, corners.max(axis=0) + 1)
+    n = sub.shape
+    inside[lo[0] : lo[0] + n[0], lo[1] : lo[1] + n[1], lo[2] : lo[2] + n[2]] = nodule.distance(sub.points()) < 0
+    return Mask(inside, grid.ras_from_ijk)
+
+
+def _coarse(grid: Grid, step_mm: float) -> tuple[Grid, int]:
+    step = max(int(step_mm / grid.spacing.min()), 1)
+    affine = grid.ras_from_ijk @ np.diag([step, step, step, 1])
+    n = [(s - 1) // step + 2 for s in grid.shape]
+    return Grid((n[0], n[1], n[2]), affine), step
+
+
+def _walls(body: Volume, state: State, grid: Grid) -> Array:
+    coarse, step = _coarse(grid, 7.0)
+    points = state.unposed(coarse.points().reshape(-1, 3))
+    source = body.grid.to_ijk(state.motion.inverse(points, 0.02)).reshape(*coarse.shape, 3)
+    index = np.stack([refine(source[..., m], step, grid.shape) for m in range(3)])
+    return ndimage.map_coordinates(body.hu, index, order=1, mode="nearest", prefilter=False)
+
+
+def _lung_sources(state: State, grid: Grid, within: Array) -> tuple[Array, Array]:
+    """CT points (n, 3) of the voxels `within` (flat indices) and volume ratios (n,), continued beyond the lung."""
+    coarse, step = _coarse(grid, 4.5)
+    x = state.unposed(coarse.points().reshape(-1, 3))
+    room = state.cavity.sample(x) < 2.0 * step * grid.spacing.max()
+    mapped = state.lung_map(state.samples)
+    source = np.zeros((len(x), 3))
+    ratio = np.ones(len(x))
+    found, left = state.lung_map.inverse(x[room], state.samples, 1e-3)
+    near = _nearest(mapped, x[room])
+    plain = state.samples[near] + 1.5 * (x[room] - mapped[near])
+    bad = (left > 0.01) | (np.linalg.norm(x[room] - mapped[near], axis=1) > 14)
+    found[bad] = plain[bad]
+    source[room] = found
+    ratio[room] = np.clip(determinant(state.lung_map.with_gradient(found)[1]), 0.2, 3.0)
+    fields = np.concatenate([source, ratio[:, None]], axis=1).reshape(*coarse.shape, 4)
+    fine = np.stack([refine(fields[..., m], step, grid.shape).ravel()[within] for m in range(4)], axis=1)
+    return fine[:, :3], fine[:, 3]
+
+
+def _nearest(cloud: Array, points: Array) -> Array:
+
+    return cKDTree(cloud).query(points)[1]

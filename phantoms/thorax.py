@@ -1,0 +1,241 @@
+"""One person's thorax as tissue: organs, trees, nodule, and their densities, ready to be imaged in any state."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from phantoms.anatomy import Build, Shapes, draw_build, make_shapes, spine_y
+from phantoms.fields import Lattice, coverage, smooth_noise, smoothstep
+from phantoms.skeleton import Vertebra, draw_bones, draw_spine
+from phantoms.trees import Tree, draw_tubes, grow, tubes
+from registration.volume import Grid
+
+Array = NDArray[Any]
+BLOOD_HU, WALL_HU, AIR_HU, NODULE_HU = 42.0, 10.0, -990.0, 25.0
+
+
+@dataclass(frozen=True)
+class LungTrees:
+    """Trees of one lung, RAS mm in the CT: bronchi, pulmonary arteries along them, veins between them."""
+
+    airway: Tree
+    artery: Tree
+    vein: Tree
+
+
+@dataclass(frozen=True)
+class Nodule:
+    """Solid lesion: a ball of radius (mm) whose surface waves by `relief` mm. centre: (3,) RAS mm in the CT."""
+
+    centre: Array
+    radius: float
+    relief: float
+
+    def distance(self, points: Array) -> Array:
+        """Signed distance in mm of points (..., 3), negative inside."""
+        d = points - self.centre
+        r = np.linalg.norm(d, axis=-1)
+        wave = np.sin(0.9 * d[..., 0] + 1) * np.sin(0.8 * d[..., 1] + 2) * np.sin(0.7 * d[..., 2] + 3)
+        return r - self.radius - self.relief * wave
+
+
+@dataclass(frozen=True)
+class Thorax:
+    """A person. parenchyma: HU of the lung's tissue without its trees, in the CT; hila: (right, left) RAS mm."""
+
+    shapes: Shapes
+    spine: list[Vertebra]
+    parenchyma: Lattice
+    hila: tuple[Array, Array]
+    trees: tuple[LungTrees, LungTrees]
+    nodule: Nodule
+    side: str
+    seed: int
+
+    @property
+    def build(self) -> Build:
+        """Measures of the person."""
+        return self.shapes.build
+
+    def index(self, side: str) -> int:
+        """Place of a side in the pairs of this class."""
+        return 0 if side == "right" else 1
+
+
+def draw_thorax(side: str, nodule_depth: float, nodule_radius: float, seed: int) -> Thorax:
+    """Person with a nodule `nodule_depth` mm below the pleura of the lung on `side`, drawn from a seed."""
+    rng = np.random.default_rng([seed, 1])
+    build = draw_build(rng)
+    shapes = make_shapes(build)
+    spine = draw_spine(build, float(shapes.body.origin[2]), build.apex + 16, rng)
+    hila = (_hilum(shapes.right_lung, 1), _hilum(shapes.left_lung, -1))
+    trees = (_lung_trees(shapes.right_lung, hila[0], 1, rng), _lung_trees(shapes.left_lung, hila[1], -1, rng))
+    centre = _place_nodule(shapes.lung(side), nodule_depth, 1 if side == "right" else -1, rng)
+    nodule = Nodule(centre, nodule_radius, 0.12 * nodule_radius)
+    return Thorax(shapes, spine, _parenchyma(shapes, rng), hila, trees, nodule, side, seed)
+
+
+def ct_grid(thorax: Thorax, spacing: tuple[float, float, float]) -> Grid:
+    """Image grid of the CT: axes to the left, back and top of the patient, the whole lattice of shapes inside."""
+    body = thorax.shapes.body
+    low = body.origin
+    high = low + body.spacing * (np.array(body.values.shape) - 1)
+    step = np.array([-spacing[0], -spacing[1], spacing[2]])
+    n = np.floor((high - low) / np.abs(step)).astype(int)
+    affine = np.diag([*step, 1.0])
+    affine[:3, 3] = [high[0], high[1], low[2]]
+    return Grid((int(n[0]), int(n[1]), int(n[2])), affine)
+
+
+def image_body(thorax: Thorax, grid: Grid, open_lungs: tuple[str, ...]) -> Array:
+    """Noise-free HU on `grid` of everything outside the lungs, and of the lungs named in `open_lungs`.
+
+    Where a lung is left out, its place is filled with the tissue that would be there without it.
+    """
+    rng = np.random.default_rng([thorax.seed, 2])
+    s = thorax.shapes
+    width = float(grid.spacing.mean())
+    hu = _soft_tissue(thorax, grid, width, rng)
+    draw_bones(hu, grid, s.build, thorax.spine, rng)
+    for side in open_lungs:
+        lung = s.lung(side).on(grid)
+        hu += coverage(lung, width) * (thorax.parenchyma.on(grid) - hu)
+    _draw_great_tubes(hu, thorax, grid, width)
+    for side in open_lungs:
+        draw_lung_trees(hu, thorax.trees[thorax.index(side)], grid, width)
+    return hu
+
+
+def draw_lung_trees(hu: Array, trees: LungTrees, grid: Grid, width: float) -> None:
+    """Paint vessels and airways of one lung into an image (HU) whose axes are parallel to those of the trees' frame."""
+    rng = np.random.default_rng(7)
+    blood = np.zeros(grid.shape, dtype=np.float32)
+    for tree in (trees.artery, trees.vein):
+        draw_tubes(blood, grid, *tubes(tree, 0.07, rng), width)
+    hu += blood * (BLOOD_HU - hu)
+    draw_airways(hu, grid, *tubes(trees.airway, 0.03, rng), width)
+
+
+def draw_airways(hu: Array, grid: Grid, ends: Array, radii: Array, width: float) -> None:
+    """Paint tubes with a wall and air inside. radii: (n, 2) mm of the lumen."""
+    wall, lumen = np.zeros(grid.shape, dtype=np.float32), np.zeros(grid.shape, dtype=np.float32)
+    draw_tubes(wall, grid, ends, radii + 0.5 + 0.14 * radii, width)
+    draw_tubes(lumen, grid, ends, radii, width)
+    hu += wall * (WALL_HU - hu)
+    hu += lumen * (AIR_HU - hu)
+
+
+def _soft_tissue(thorax: Thorax, grid: Grid, width: float, rng: np.random.Generator) -> Array:
+    s, b = thorax.shapes, thorax.build
+    x, y, z = s.body.axes
+    fibres = smooth_noise(s.body, 5.0, rng)
+    patches = smooth_noise(s.body, 9.0, rng)
+    fat = b.fat[1] + (b.fat[0] - b.fat[1]) * smoothstep(y, -20, 60) + 1.5 * patches
+    wall = 52 - 150 * smoothstep(fibres, 1.1, 1.7) + 6 * patches
+    outside = wall + smoothstep(s.body.values + fat, -1.5, 1.5) * (-102 + 5 * patches - wall)
+    middle = 15 - 95 * smoothstep(patches + 0.02 * y, -0.4, 1.0)
+    belly = _belly(thorax, x, y, z, patches)
+    below = smoothstep(-s.below_diaphragm.values, -1.5, 1.5)
+    inside = middle + below * (belly - middle)
+    inside = inside + smoothstep(-s.heart.values, -1.5, 1.5) * (38 + 3 * patches - inside)
+    field = inside + smoothstep(s.cage.values, -1.5, 1.5) * (outside - inside)
+    hu = s.body.like(field).on(grid)
+    skin = s.body.on(grid)
+    hu += coverage(-skin - 2.0, width) * (15 - hu)
+    hu += (1 - coverage(skin, width)) * (-1000 - hu)
+    return hu
+
+
+def _belly(thorax: Thorax, x: Array, y: Array, z: Array, patches: Array) -> Array:
+    b = thorax.build
+    fat = -98 + 4 * patches
+    top = b.dome[1]
+    liver = smoothstep(x + 0.35 * (y - 20) - 0.25 * (z - top), -38, -30)
+    spleen = 1 - np.sqrt(((x + 88) / 36) ** 2 + ((y + 42) / 45) ** 2 + ((z - top + 42) / 46) ** 2)
+    stomach = 1 - np.sqrt(((x + 58) / 40) ** 2 + ((y - 28) / 38) ** 2 + ((z - top + 44) / 38) ** 2)
+    gas = smoothstep(stomach, 0.08, 0.14) * smoothstep(y, 38, 41)
+    hu = fat + liver * (58 + 4 * patches - fat)
+    hu = hu + smoothstep(spleen, 0, 0.05) * (50 - hu)
+    hu = hu + smoothstep(stomach, 0, 0.05) * (28 - hu)
+    return hu + gas * (-985 - hu)
+
+
+def _draw_great_tubes(hu: Array, thorax: Thorax, grid: Grid, width: float) -> None:
+    b = thorax.build
+    zs = np.linspace(22, -190, 16)
+    descending = np.stack([np.full(16, -17.0), spine_y(b, zs) + 24, zs], axis=1)
+    arch = np.array([[6, 24, -25], [8, 22, 8], [3, 14, 24], [-8, -4, 31], [-16, -22, 28], descending[0]])
+    cava = np.array([[20, 14, 75], [23, 10, 20], [22, 12, -35]])
+    trunk = np.array([[-12, 32, -35], [-14, 20, -12], [-10, 2, -10]])
+    blood = np.zeros(grid.shape, dtype=np.float32)
+    paths = [(arch, 13.5), (descending, 11.5), (cava, 8.5), (trunk, 13.0)]
+    for n, hilum in enumerate(thorax.hila):
+        sign = 1 - 2 * n
+        paths.append((np.array([trunk[-1], [sign * 14, -6, -12], hilum + np.array([0, 5, 2])]), 9.0))
+        paths.append((np.array([[sign * 8, -4, -40], hilum + np.array([0, 9, -14])]), 7.5))
+    for path, radius in paths:
+        ends = np.stack([path[:-1], path[1:]], axis=1)
+        draw_tubes(blood, grid, ends, np.full((len(ends), 2), radius), width)
+    hu += blood * (BLOOD_HU - hu)
+    carina = np.array([0.0, -20.0, 10.0])
+    wind = np.array([[0.0, -14.0, b.apex + 40], [0.0, -16.0, 60.0], carina])
+    air = [[wind[0], wind[1]], [wind[1], wind[2]]]
+    radii = [[8.6, 8.6], [8.6, 8.4]]
+    for n, hilum in enumerate(thorax.hila):
+        middle = 0.5 * (carina + hilum) + [0, 0, 2]
+        air += [[carina, middle], [middle, hilum]]
+        radii += [[7.4 - n, 7.0 - n], [7.0 - n, 6.2 - n]]
+    draw_airways(hu, grid, np.array(air), np.array(radii), width)
+
+
+def _hilum(lung: Lattice, sign: int) -> Array:
+    """Where the main bronchus enters the lung: the innermost point at its level."""
+    x = np.arange(0, 90, 0.5)
+    line = np.stack([sign * x, np.full_like(x, -20), np.full_like(x, -14.0 - 4 * (sign < 0))], axis=1)
+    inside = np.flatnonzero(lung.at(line) < 0)
+    return line[inside[0]] if len(inside) else line[60]
+
+
+def _lung_trees(lung: Lattice, hilum: Array, sign: int, rng: np.random.Generator) -> LungTrees:
+    coarse = np.argwhere(lung.values[::2, ::2, ::2] < -1.0) * 2.0 * lung.spacing + lung.origin
+    cloud = coarse + rng.uniform(-3, 3, coarse.shape)
+    inward = np.array([sign * 12.0, -2.0, -6.0])
+    bundle = grow(cloud, hilum - 0.6 * inward, hilum + 0.8 * inward, 26, 0.62, 2.75)
+    veins = grow(
+        cloud + rng.uniform(-5, 5, cloud.shape),
+        hilum + np.array([0, 12, -14]) - 0.6 * inward,
+        hilum + np.array([0, 11, -16]) + 0.8 * inward,
+        26,
+        0.58,
+        2.75,
+    )
+    across = rng.standard_normal(bundle.nodes.shape)
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    across = 0.3 * across + 0.7 * np.array([0.3 * sign, 0.5, 0.8])
+    artery = bundle.moved(bundle.nodes + across * (2.1 * bundle.radius[:, None] + 0.8))
+    bronchi = bundle.moved(bundle.nodes, 0.78).keep(bundle.generation <= 6)
+    return LungTrees(bronchi, artery, veins)
+
+
+def _place_nodule(lung: Lattice, depth: float, sign: int, rng: np.random.Generator) -> Array:
+    points = lung.points()
+    distance = lung.values.ravel()
+    apt = (np.abs(distance + depth) < 1.5) & (np.abs(points[:, 2] + 45) < 45) & (sign * points[:, 0] > 55)
+    if not apt.any():
+        raise ValueError(f"no place {depth:g} mm below the pleura, choose a nodule depth between 6 and 45 mm")
+    return points[apt][rng.integers(int(apt.sum()))] + rng.uniform(-1, 1, 3)
+
+
+def _parenchyma(shapes: Shapes, rng: np.random.Generator) -> Lattice:
+    lattice = shapes.right_lung
+    _, y, _ = lattice.axes
+    coarse, fine = smooth_noise(lattice, 14.0, rng), smooth_noise(lattice, 3.5, rng)
+    dependent = -0.35 * (y + 10)
+    rind = np.minimum(np.abs(shapes.right_lung.values), np.abs(shapes.left_lung.values))
+    hu = -858 + dependent + 9 * coarse + 15 * np.clip(fine, -1.5, 3) + 12 * np.exp(-rind / 4)
+    return lattice.like(ndimage.gaussian_filter(np.clip(hu, -940, -600), 0.4))

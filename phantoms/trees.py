@@ -1,0 +1,133 @@
+"""Space-filling trees of airways and vessels, and their drawing as tapering tubes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from registration.volume import Grid
+
+Array = NDArray[Any]
+
+
+@dataclass(frozen=True)
+class Tree:
+    """Branches of a rooted binary tree. nodes: (n, 3) RAS mm; parent: (n,), -1 at the root; radius: (n,) mm of the
+    branch that ends at the node; generation: (n,)."""
+
+    nodes: Array
+    parent: Array
+    radius: Array
+    generation: Array
+
+    def moved(self, nodes: Array, scale: float = 1.0) -> Tree:
+        """The same tree with its nodes elsewhere and its radii scaled."""
+        return Tree(nodes, self.parent, self.radius * scale, self.generation)
+
+    def keep(self, chosen: Array) -> Tree:
+        """Sub-tree of the branches where `chosen` (n,) is true; a kept branch's parent must be kept."""
+        new = np.cumsum(chosen) - 1
+        parent = self.parent[chosen]
+        return Tree(
+            self.nodes[chosen], np.where(parent >= 0, new[parent], -1), self.radius[chosen], self.generation[chosen]
+        )
+
+    def forks(self) -> Array:
+        """Indices of the nodes with two children."""
+        inner = self.parent[self.parent >= 0]
+        return np.flatnonzero(np.bincount(inner, minlength=len(self.nodes)) >= 2)
+
+
+def grow(cloud: Array, root: Array, hilum: Array, leaf_points: int, leaf_radius: float, exponent: float) -> Tree:
+    """Tree from `root` through `hilum` that fills a point cloud (n, 3) by repeated halving.
+
+    Every branch runs part of the way to the middle of the points it feeds; clouds below `leaf_points` end it. Radii
+    follow r^exponent of the parent = sum over its children, from `leaf_radius` mm at the ends.
+    Ref: Tawhai 2000 (halving); Murray 1926 (radii).
+    """
+    nodes, parent, generation = [root, hilum], [-1, 0], [0, 0]
+    stack = [(cloud, 1, 1)]
+    while stack:
+        points, at, depth = stack.pop()
+        along = nodes[at] - nodes[parent[at]]
+        for half in _halves(points, along):
+            start = nodes[at]
+            leaf = len(half) < leaf_points
+            share = 0.95 if leaf else 0.42
+            end = start + share * (half.mean(axis=0) - start)
+            nodes.append(end)
+            parent.append(at)
+            generation.append(depth)
+            if not leaf:
+                stack.append((half, len(nodes) - 1, depth + 1))
+    radius = _radii(np.array(parent), leaf_radius, exponent)
+    return Tree(np.array(nodes), np.array(parent), radius, np.array(generation))
+
+
+def _halves(points: Array, along: Array) -> tuple[Array, Array]:
+    centred = points - points.mean(axis=0)
+    direction = along / max(float(np.linalg.norm(along)), 1e-9)
+    flat = centred - np.outer(centred @ direction, direction)
+    _, axes = np.linalg.eigh(flat.T @ flat)
+    side = centred @ axes[:, -1] > 0
+    return points[side], points[~side]
+
+
+def _radii(parent: Array, leaf_radius: float, exponent: float) -> Array:
+    power = np.zeros(len(parent))
+    leaf = np.bincount(parent[parent >= 0], minlength=len(parent)) == 0
+    power[leaf] = leaf_radius**exponent
+    for n in range(len(parent) - 1, 0, -1):
+        power[parent[n]] += power[n]
+    return power ** (1 / exponent)
+
+
+def tubes(tree: Tree, wiggle: float, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Centre lines of a tree as three tapering pieces a branch: ends (n, 2, 3) mm and radii (n, 2) mm.
+
+    The bend of a branch is `wiggle` times its length.
+    """
+    child = np.flatnonzero(tree.parent >= 0)
+    a, b = tree.nodes[tree.parent[child]], tree.nodes[child]
+    length = np.linalg.norm(b - a, axis=1, keepdims=True)
+    bend = rng.standard_normal(a.shape) * wiggle * length
+    inner = [a + t * (b - a) + bend * 4 * t * (1 - t) for t in (1 / 3, 2 / 3)]
+    path = np.stack([a, *inner, b], axis=1)
+    parent_radius = np.minimum(tree.radius[tree.parent[child]], 1.25 * tree.radius[child])
+    r = np.stack(
+        [parent_radius + t * (tree.radius[child] * 0.92 - parent_radius) for t in (0, 1 / 3, 2 / 3, 1)], axis=1
+    )
+    ends = np.stack([path[:, :-1], path[:, 1:]], axis=2).reshape(-1, 2, 3)
+    return ends, np.stack([r[:, :-1], r[:, 1:]], axis=2).reshape(-1, 2)
+
+
+def draw_tubes(share: Array, grid: Grid, ends: Array, radii: Array, width_mm: float) -> None:
+    """Raise `share` (0..1, one value a voxel) to the share of each voxel that tubes fill; the grid is parallel to RAS.
+
+    Tubes thinner than `width_mm`, the edge of a voxel, fill less than all of it.
+    """
+    step = np.diag(grid.ras_from_ijk[:3, :3])
+    origin = grid.ras_from_ijk[:3, 3]
+    shape = np.array(grid.shape)
+    for (p, q), (rp, rq) in zip(ends, radii, strict=True):
+        reach = max(rp, rq) + width_mm / 2
+        corners = (np.array([np.minimum(p, q) - reach, np.maximum(p, q) + reach]) - origin) / step
+        lo = np.maximum(np.ceil(corners.min(axis=0)), 0).astype(int)
+        hi = np.minimum(np.floor(corners.max(axis=0)) + 1, shape).astype(int)
+        if np.any(hi <= lo):
+            continue
+        x, y, z = (origin[m] + step[m] * np.arange(lo[m], hi[m]) - p[m] for m in range(3))
+        d = q - p
+        dd = max(float(d @ d), 1e-12)
+        t = ((x * d[0])[:, None, None] + (y * d[1])[None, :, None] + (z * d[2])[None, None, :]) / dd
+        np.clip(t, 0, 1, out=t)
+        square = (
+            (x[:, None, None] - t * d[0]) ** 2 + (y[None, :, None] - t * d[1]) ** 2 + (z[None, None, :] - t * d[2]) ** 2
+        )
+        r = rp + t * (rq - rp)
+        fill = np.clip(0.5 - (np.sqrt(square) - r) / width_mm, 0, 1) * np.minimum(1, (2 * r / width_mm) ** 1.2)
+        box = share[lo[0] : hi[0], lo[1] : hi[1], lo[2] : hi[2]]
+        np.maximum(box, fill, out=box)
