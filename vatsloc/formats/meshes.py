@@ -59,7 +59,7 @@ def read_vtu(path: Path) -> TetraMesh:
     """Tetrahedra and data of a .vtu in LPS mm. Raises InputRefused when unreadable or of other cells."""
     _check_exists(path)
     try:
-        mesh = meshio.read(path, file_format="vtu")
+        mesh = meshio.vtu.read(path)  # meshio.read prints and exits on a bad file
     except Exception as error:
         raise InputRefused(f"{path} is not a readable .vtu mesh ({error}); write it again.") from error
     if len(mesh.cells) != 1 or mesh.cells[0].type != "tetra":
