@@ -152,6 +152,7 @@ def enhanced(axes: np.ndarray, order: list[int]) -> Dataset:
 def test_multi_frame_with_functional_groups(tmp_path, axes):
     save(tmp_path / "cbct", [enhanced(axes, [5, 0, 1, 2, 4, 3])])
     check_ramp(read_volume(tmp_path / "cbct"))
+    check_ramp(read_volume(tmp_path / "cbct" / "IM000"))
     (tmp_path / "cbct" / "IM000").rename(tmp_path / "cbct.dcm")
     check_ramp(read_volume(tmp_path / "cbct.dcm"))
 

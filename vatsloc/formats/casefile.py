@@ -57,7 +57,7 @@ class Setup(_Table):
         if gravity is not None:
             length = float(np.linalg.norm(gravity))
             if abs(length - 1) > GRAVITY_LENGTH_TOLERANCE:
-                raise ValueError(f"has length {length:.3g}, 1 needed; divide it by its length")
+                raise ValueError(f"has length {length:.3g}, 1 needed; give a unit vector")
         return gravity
 
 
@@ -113,7 +113,8 @@ def read_case_file(folder: Path) -> CaseFile:
 
 
 def _sentence(error: ValidationError) -> str:
-    first = error.errors(include_url=False)[0]
+    # An unknown key first: a misspelt name also shows as a missing one, and says less.
+    first = min(error.errors(include_url=False), key=lambda e: e["type"] != "extra_forbidden")
     names = [str(part) for part in first["loc"]]
     where = _key(names) if names else "the file"
     if first["type"] == "extra_forbidden":
@@ -128,7 +129,9 @@ def _sentence(error: ValidationError) -> str:
 
 
 def _key(names: list[str]) -> str:
-    return f"[{names[0]}] {' '.join(names[1:])}".rstrip() if len(names) > 1 or names[0] in _tables() else names[0]
+    if len(names) == 1:
+        return f"[{names[0]}]" if names[0] in _tables() else names[0]
+    return f"[{names[0]}] {names[1]}" + "".join(f"[{index}]" for index in names[2:])
 
 
 def _tables() -> dict[str, type[BaseModel]]:

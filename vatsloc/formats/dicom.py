@@ -71,7 +71,7 @@ def read_dicom(path: Path) -> RawImage:
     else:
         _check_one_series(headers, path)
         frames = [_frame_of_slice(file, header) for file, header in headers]
-    return _stack(frames, path)
+    return _stack(frames, (int(headers[0][1].Rows), int(headers[0][1].Columns)), path)
 
 
 def _headers(path: Path) -> list[tuple[Path, Dataset]]:
@@ -176,7 +176,7 @@ def _frame(
     )
 
 
-def _stack(frames: list[_Frame], path: Path) -> RawImage:
+def _stack(frames: list[_Frame], shape: tuple[int, int], path: Path) -> RawImage:
     if len(frames) < 2:
         raise InputRefused(f"{path} holds one slice, at least 2 needed; name the folder with the whole series.")
     first = frames[0]
@@ -193,18 +193,13 @@ def _stack(frames: list[_Frame], path: Path) -> RawImage:
     # First to last slice, not the normal, so that a gantry tilt shows as shear.
     lps_from_ijk[:3, 2] = (frames[-1].position - frames[0].position) / (len(frames) - 1)
     lps_from_ijk[:3, 3] = frames[0].position
-    hu: Array | None = None
+    hu = np.empty((len(frames), *shape), dtype=np.float32)
     for k, frame in enumerate(frames):
         pixels = frame.pixels()
-        if pixels.ndim != 2:
-            raise InputRefused(f"{path} has a slice with pixels of shape {pixels.shape}; export grey values.")
-        if hu is None:
-            hu = np.empty((pixels.shape[1], pixels.shape[0], len(frames)), dtype=np.float32)
-        hu[:, :, k] = pixels.T * np.float32(frame.slope) + np.float32(frame.intercept)
+        hu[k] = pixels * np.float32(frame.slope) + np.float32(frame.intercept)
         if frame.padding is not None:
-            hu[:, :, k][np.equal(pixels.T, frame.padding)] = PADDING_HU
-    assert hu is not None
-    return RawImage(hu, flip_affine(lps_from_ijk), path)
+            hu[k][pixels == frame.padding] = PADDING_HU
+    return RawImage(hu.T, flip_affine(lps_from_ijk), path)
 
 
 def _check_even(places: list[float], path: Path) -> None:

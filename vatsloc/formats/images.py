@@ -79,4 +79,7 @@ def _reader(path: Path) -> Callable[[Path], RawImage]:
     for suffix, reader in _READERS.items():
         if name.endswith(suffix):
             return reader
+    with path.open("rb") as file:
+        if file.read(132)[128:] == b"DICM":  # DICOM files often carry no suffix
+            return read_dicom
     raise CaseError(f"{path} has no known image suffix; use {', '.join(_READERS)} or a folder of DICOM slices.")
