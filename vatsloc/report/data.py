@@ -3,26 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from registration.rigid import RigidTransform
 from registration.volume import Array, Mask, Volume
+from vatsloc.formats.meshes import Surface
 
 # Okabe & Ito's colour-blind safe palette; a name says what it is drawn for.
 NODULE = "#F0E442"
 SURFACE = "#56B4E9"
 LUNG = "#E69F00"
 MESH = "#CC79A7"
-
-
-@dataclass(frozen=True)
-class Surface:
-    """Triangle surface. points: (n, 3) RAS mm; triangles: (t, 3) indices."""
-
-    points: Array
-    triangles: Array
 
 
 @dataclass(frozen=True)
@@ -50,16 +44,19 @@ class Nodule:
 
 @dataclass(frozen=True)
 class Comparison:
-    """One phase: the fixed image with the moving one before and after; planes pass through the nodule.
+    """One phase: a fixed image with a moving one before and after it, in planes through the nodule.
 
-    The three volumes may lie on any grids. `before` is the moving image after the rigid pose alone.
+    before: in its own space, seen through `before_from_fixed`, the rigid pose alone; after: warped to the fixed image's
+    space, on any grid.
     """
 
     title: str
     fixed_name: str
-    moving_name: str
     fixed: Volume
+    before_name: str
     before: Volume
+    before_from_fixed: RigidTransform
+    after_name: str
     after: Volume
     nodule: Nodule
     outlines: tuple[Outline, ...] = ()
@@ -92,7 +89,6 @@ class ReportData:
     depth_mm: float | None = None
     nearest_surface_ras: Array | None = None
     window_hu: tuple[float, float] = (-1000.0, 250.0)
-    facts: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

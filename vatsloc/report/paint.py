@@ -9,7 +9,8 @@ import cv2
 import numpy as np
 
 from registration.volume import Array, Mask, Volume
-from vatsloc.report.data import NODULE, Nodule, Outline, Surface
+from vatsloc.formats.meshes import Surface
+from vatsloc.report.data import NODULE, Nodule, Outline
 from vatsloc.report.planes import Plane, ellipse, sample, section
 
 # Lines are drawn with sub-pixel ends: OpenCV takes integers in units of 2**-SHIFT pixel.
@@ -41,12 +42,9 @@ def bgr(colour: str) -> tuple[int, int, int]:
 def draw_outline(image: Array, plane: Plane, outline: Outline, thickness: int = 1) -> None:
     """Draw a surface's section or a mask's border on BGR or BGRA pixels of the plane, in place."""
     if isinstance(outline.shape, Surface):
-        lines = list(section(outline.shape, plane))
-        closed = False
+        _lines(image, section(outline.shape, plane), False, outline.colour, thickness)
     else:
-        lines = _borders(outline.shape, plane)
-        closed = True
-    _lines(image, lines, closed, outline.colour, thickness)
+        _lines(image, _borders(outline.shape, plane), True, outline.colour, thickness)
 
 
 def draw_nodule(image: Array, plane: Plane, nodule: Nodule, thickness: int = 2) -> None:
@@ -59,10 +57,10 @@ def draw_nodule(image: Array, plane: Plane, nodule: Nodule, thickness: int = 2) 
     if away > max(2.0, float(np.linalg.norm(plane.right))):
         return
     at = plane.to_pixels(nodule.centre_ras)
-    cv2.circle(image, _fixed_point(at), 2 << SHIFT, _colour(image, NODULE), cv2.FILLED, cv2.LINE_AA, SHIFT)
+    cv2.circle(image, _fixed_point(at), 3 << (SHIFT - 1), _colour(image, NODULE), cv2.FILLED, cv2.LINE_AA, SHIFT)
     for direction in ((1, 0), (-1, 0), (0, 1), (0, -1)):
         arm = np.array(direction, dtype=float)
-        _lines(image, [np.array([at + 7 * arm, at + 14 * arm])], False, NODULE, 1)
+        _lines(image, [np.array([at + 9 * arm, at + 16 * arm])], False, NODULE, 1)
 
 
 def layer(plane: Plane, outlines: Sequence[Outline], nodule: Nodule | None) -> Array:
@@ -98,9 +96,14 @@ def _borders(mask: Mask, plane: Plane) -> list[Array]:
     return [border[:, 0, :].astype(float) for border in borders]
 
 
-def _lines(image: Array, lines: Sequence[Array], closed: bool, colour: str, thickness: int) -> None:
-    if lines:
-        points = [np.rint(np.asarray(line) * (1 << SHIFT)).astype(np.int32) for line in lines]
+def _lines(image: Array, lines: Array | list[Array], closed: bool, colour: str, thickness: int) -> None:
+    """Lines of equal length as one array (s, p, 2), else as a list of (p, 2)."""
+    if len(lines):
+        scale = 1 << SHIFT
+        if isinstance(lines, list):
+            points = [np.rint(line * scale).astype(np.int32) for line in lines]
+        else:
+            points = list(np.rint(lines * scale).astype(np.int32))
         cv2.polylines(image, points, closed, _colour(image, colour), thickness, cv2.LINE_AA, SHIFT)
 
 

@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import ndimage
 
-from registration.interpolate import interpolate
+from registration.rigid import RigidTransform
 from registration.volume import Array, Grid, Volume
-from vatsloc.report.data import Surface
+from vatsloc.formats.meshes import Surface
 
 AXES = {"axial": 2, "coronal": 1, "sagittal": 0}
 
@@ -37,20 +38,10 @@ class Plane:
         n = np.cross(self.right, self.down)
         return n / np.linalg.norm(n)
 
-    def points(self) -> Array:
-        """Pixel centres, (rows, columns, 3), RAS mm."""
-        r, c = (np.arange(n, dtype=float) for n in self.shape)
-        return self.origin + r[:, None, None] * self.down + c[None, :, None] * self.right
-
     def to_pixels(self, points_ras: Array) -> Array:
         """(column, row) of points (..., 3), foot of the perpendicular, (..., 2)."""
         d = np.asarray(points_ras, dtype=float) - self.origin
         return np.stack([d @ self.right / (self.right @ self.right), d @ self.down / (self.down @ self.down)], axis=-1)
-
-
-def ready(volume: Volume) -> Volume:
-    """The same image in the memory order that sampling wants, so that it is not rearranged for every plane."""
-    return Volume(np.ascontiguousarray(volume.hu, dtype=np.float32), volume.ras_from_ijk)
 
 
 def box_of(grid: Grid) -> tuple[Array, Array]:
@@ -71,14 +62,24 @@ def plane_through(name: str, at_ras: Array, box: tuple[Array, Array], spacing_mm
     return Plane(name, origin, right * spacing_mm, down * spacing_mm, (rows, columns))
 
 
-def sample(volume: Volume, plane: Plane, fill: float = -1000.0) -> Array:
-    """Image on the plane's pixels, (rows, columns) float32, trilinear; `fill` outside the volume."""
-    return interpolate(volume.hu, volume.grid, plane.points().reshape(-1, 3), fill).reshape(plane.shape)
+def sample(volume: Volume, plane: Plane, seen_through: RigidTransform | None = None, fill: float = -1000.0) -> Array:
+    """Image on the plane's pixels, (rows, columns) float32, trilinear; `fill` outside the volume.
+
+    seen_through: map from the plane's space to the volume's.
+    """
+    to_volume = volume.grid.ijk_from_ras @ (np.eye(4) if seen_through is None else seen_through.matrix)
+    matrix = to_volume[:3, :3] @ np.stack([plane.down, plane.right, plane.normal], axis=1)
+    offset = to_volume[:3, :3] @ plane.origin + to_volume[:3, 3]
+    shape = (*plane.shape, 1)
+    picture = ndimage.affine_transform(
+        volume.hu, matrix, offset, shape, np.float32, order=1, mode="constant", cval=fill
+    )
+    return picture[..., 0]
 
 
 def section(surface: Surface, plane: Plane) -> Array:
     """Line segments in which a triangle surface meets the plane, (s, 2, 2): two (column, row) points each."""
-    height = (surface.points - plane.origin) @ plane.normal
+    height = (surface.points_ras - plane.origin) @ plane.normal
     # A vertex exactly in the plane would give three crossings in one triangle; it is taken as just above.
     height = np.where(height == 0, 1e-9, height)
     h = height[surface.triangles]
@@ -92,7 +93,7 @@ def section(surface: Surface, plane: Plane) -> Array:
     for step in (1, 2):
         other = (alone + step) % 3
         t = h[rows, alone] / (h[rows, alone] - h[rows, other])
-        a, b = surface.points[cut[rows, alone]], surface.points[cut[rows, other]]
+        a, b = surface.points_ras[cut[rows, alone]], surface.points_ras[cut[rows, other]]
         ends.append(plane.to_pixels(a + t[:, None] * (b - a)))
     return np.stack(ends, axis=1)
 

@@ -12,13 +12,15 @@ import jinja2
 import numpy as np
 from markupsafe import Markup
 
-from registration.volume import Array
+from registration.volume import Array, Grid
 from vatsloc.frames import flip_points
 from vatsloc.report.charts import bars, box_plot
 from vatsloc.report.data import NODULE, Comparison, Nodule, Outline, Picture, ReportData, TreSection
 from vatsloc.report.paint import as_bgr, draw_nodule, draw_outline, green_magenta, grey, jpeg
-from vatsloc.report.planes import AXES, EDGE_LETTERS, box_of, plane_through, ready, sample
+from vatsloc.report.planes import AXES, EDGE_LETTERS, Plane, box_of, plane_through, sample
 from vatsloc.report.stack import stacks
+
+STILL_PIXELS = 480
 
 SCORES_FROM, SCORES_TO = "<!-- scores: evaluate writes here -->", "<!-- end of scores -->"
 
@@ -47,27 +49,31 @@ _SHOWN = {
 
 @dataclass(frozen=True)
 class View:
-    """One picture of the page. src: data URI; edges: letters at the left, top, right and bottom."""
+    """One picture of the page. src: data URI; edges: letters at left, top, right, bottom; aspect: width / height."""
 
     src: str
     alt: str
     edges: str
     plane: str
+    aspect: float
 
 
 def render(data: ReportData) -> str:
     """The whole page as text."""
     viewer = stacks(data.phases[-1], data.window_hu) if data.phases else []
     level, verdict = judge(data.run)
+    gates = data.run.get("gates", {})
     seconds = data.run.get("seconds", {})
     stages = {name: float(s) for name, s in seconds.items() if name != "total"}
-    peak = data.run.get("peak_mb", {})
-    memory = {str(k): float(v) for k, v in peak.items()} if isinstance(peak, Mapping) else {"whole run": float(peak)}
+    memory = data.run.get("peak_mb_by_stage") or {"whole run": data.run.get("peak_mb")}
+    memory = {name: float(mb) for name, mb in memory.items() if mb is not None}
     return _page("report.html").render(
         data=data,
         run=data.run,
         level=level,
         verdict=verdict,
+        failed=[(name, gate) for name, gate in gates.items() if not gate["ok"]],
+        passed=[(name, gate) for name, gate in gates.items() if gate["ok"]],
         nodule_ras=data.nodule.centre_ras,
         nodule_lps=flip_points(data.nodule.centre_ras),
         nearest_lps=None if data.nearest_surface_ras is None else flip_points(data.nearest_surface_ras),
@@ -123,42 +129,43 @@ def judge(run: Mapping[str, Any]) -> tuple[str, str]:
 
 
 def _before_after(phase: Comparison, window: tuple[float, float]) -> list[tuple[str, list[View]]]:
-    """Blends before and after, in three planes each."""
-    rows = []
-    fixed = ready(phase.fixed)
-    for when, moving in (("before", ready(phase.before)), ("after", ready(phase.after))):
-        views = []
-        for name in AXES:
-            plane = plane_through(
-                name, phase.nodule.centre_ras, box_of(phase.fixed.grid), _spacing(phase.fixed.grid.spacing)
-            )
-            image = green_magenta(grey(sample(moving, plane), window), grey(sample(fixed, plane), window))
-            if when == "after":
-                for outline in phase.outlines:
-                    draw_outline(image, plane, outline)
+    """Blends before and after, in three planes each, with a heading."""
+    rows: list[tuple[str, list[View]]] = [
+        (f"Before: {phase.before_name}, rigid pose alone", []),
+        (f"After: {phase.after_name}", []),
+    ]
+    for plane in _planes(phase.fixed.grid, phase.nodule.centre_ras):
+        below = grey(sample(phase.fixed, plane), window)
+        first = green_magenta(grey(sample(phase.before, plane, phase.before_from_fixed), window), below)
+        second = green_magenta(grey(sample(phase.after, plane), window), below)
+        for outline in phase.outlines:
+            draw_outline(second, plane, outline)
+        for image, (heading, views) in zip((first, second), rows, strict=True):
             draw_nodule(image, plane, phase.nodule)
-            alt = (
-                f"{phase.title}, {when}: {name} plane, {phase.moving_name} in green over {phase.fixed_name} in magenta"
-            )
-            views.append(View(jpeg(image), alt, EDGE_LETTERS[name], name))
-        rows.append((when, views))
+            alt = f"{phase.title}. {heading}. {plane.name} plane, in green over {phase.fixed_name} in magenta"
+            views.append(_view(image, alt, plane))
     return rows
 
 
 def _views(picture: Picture, window: tuple[float, float]) -> list[View]:
-    views, volume = [], ready(picture.image)
-    for name in AXES:
-        plane = plane_through(name, picture.at_ras, box_of(picture.image.grid), _spacing(picture.image.grid.spacing))
-        image = as_bgr(grey(sample(volume, plane), window))
+    views = []
+    for plane in _planes(picture.image.grid, picture.at_ras):
+        image = as_bgr(grey(sample(picture.image, plane), window))
         for outline in picture.outlines:
             draw_outline(image, plane, outline)
-        views.append(View(jpeg(image), f"{picture.title}: {name} plane", EDGE_LETTERS[name], name))
+        views.append(_view(image, f"{picture.title}: {plane.name} plane", plane))
     return views
 
 
-def _spacing(voxel_mm: Array) -> float:
-    """Pixel of the still pictures in mm: finer than a voxel, so that lines are crisp."""
-    return float(np.clip(voxel_mm.min(), 0.8, 1.5) * 0.7)
+def _view(image: Array, alt: str, plane: Plane) -> View:
+    return View(jpeg(image, 86), alt, EDGE_LETTERS[plane.name], plane.name, plane.shape[1] / plane.shape[0])
+
+
+def _planes(grid: Grid, at_ras: Array) -> list[Plane]:
+    """Three planes through a point; pixels finer than voxels keep drawn lines crisp."""
+    box = box_of(grid)
+    spacing = max(float((box[1] - box[0]).max()) / STILL_PIXELS, 0.5)
+    return [plane_through(name, at_ras, box, spacing) for name in AXES]
 
 
 def _semi_axes(nodule: Nodule) -> Array | None:

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from registration.volume import Array, Volume
+from registration.volume import Array
 from vatsloc.report.data import Comparison, Nodule, Outline
 from vatsloc.report.paint import grey, jpeg, layer, png
-from vatsloc.report.planes import AXES, EDGE_LETTERS, Plane, box_of, plane_through, ready, sample
+from vatsloc.report.planes import AXES, EDGE_LETTERS, Plane, box_of, plane_through, sample
 
 SLICES = 40
 LARGEST_PIXELS = 256
@@ -51,8 +52,8 @@ def stacks(comparison: Comparison, window_hu: tuple[float, float]) -> list[Stack
     """Axial, coronal and sagittal slices of a phase's fixed and warped image, the nodule's slice among them."""
     box = box_of(comparison.fixed.grid)
     spacing = max(1.0, float((box[1] - box[0]).max()) / LARGEST_PIXELS)
-    volumes = (ready(comparison.fixed), ready(comparison.after))
-    return [_stack(name, volumes, comparison, box, spacing, window_hu) for name in AXES]
+    with ThreadPoolExecutor(max_workers=2) as pool:  # sampling and encoding release the interpreter lock
+        return list(pool.map(lambda name: _stack(name, comparison, box, spacing, window_hu), AXES))
 
 
 def slice_positions(at_mm: float, low_mm: float, high_mm: float, n: int = SLICES) -> tuple[Array, int]:
@@ -65,7 +66,6 @@ def slice_positions(at_mm: float, low_mm: float, high_mm: float, n: int = SLICES
 
 def _stack(
     name: str,
-    volumes: tuple[Volume, Volume],
     comparison: Comparison,
     box: tuple[Array, Array],
     spacing: float,
@@ -74,7 +74,9 @@ def _stack(
     axis, centre = AXES[name], comparison.nodule.centre_ras
     positions, start = slice_positions(centre[axis], box[0][axis], box[1][axis])
     planes = [_at(name, centre, p, box, spacing) for p in positions]
-    fixed, moving = ([jpeg(grey(sample(v, plane), window_hu), 75) for plane in planes] for v in volumes)
+    fixed, moving = (
+        [jpeg(grey(sample(v, plane), window_hu), 75) for plane in planes] for v in (comparison.fixed, comparison.after)
+    )
     lines = [png(_sharp_layer(plane, comparison.outlines, comparison.nodule)) for plane in planes]
     return Stack(planes[start], positions, start, fixed, moving, lines)
 

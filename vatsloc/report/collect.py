@@ -1,0 +1,97 @@
+"""From a case and its result to what the report shows."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from poro.mesh import TetMesh, TriSurface, closest_points
+from registration.rigid import RigidTransform
+from registration.volume import Array
+from vatsloc.case import Case
+from vatsloc.formats.meshes import Surface, TetraMesh
+from vatsloc.frames import flip_points
+from vatsloc.report.data import LUNG, MESH, SURFACE, Comparison, Nodule, Outline, Picture, ReportData
+from vatsloc.results import ResultData, RunRecord
+
+
+def report_data(case: Case, result: ResultData, pictures: tuple[Picture, ...] = ()) -> ReportData:
+    """Both phases, the lung's meshes and surfaces, and the nodule's depth; `pictures` come after those made here.
+
+    The ellipsoid is drawn where run.json holds its axes as well: details["nodule_ellipsoid95_axes_lps"], (3, 3), a unit
+    vector per semi-axis.
+    """
+    inflated, deflated = _outer(result.lung_inflated), _outer(result.lung_deflated)
+    nodule = Nodule(result.nodule_deflated_ras, _ellipsoid(result.run))
+    phases = (
+        Comparison(
+            title="Phase 1: change of pose",
+            fixed_name="inflated CBCT",
+            fixed=case.cbct_inflated,
+            before_name="CT",
+            before=case.ct,
+            before_from_fixed=RigidTransform(result.rigid_inflated_from_ct).inverse(),
+            after_name="CT warped to the inflated CBCT",
+            after=result.ct_in_inflated,
+            nodule=Nodule(result.nodule_inflated_ras),
+            outlines=(Outline("lung model", LUNG, inflated),),
+        ),
+        Comparison(
+            title="Phase 2: pneumothorax",
+            fixed_name="deflated CBCT",
+            fixed=case.cbct_deflated,
+            before_name="inflated CBCT",
+            before=case.cbct_inflated,
+            before_from_fixed=RigidTransform(result.rigid_deflated_from_inflated).inverse(),
+            after_name="CT warped through both phases",
+            after=result.ct_in_deflated,
+            nodule=nodule,
+            outlines=(
+                Outline("deflated surface", SURFACE, result.deflated_surface),
+                Outline("lung model", LUNG, deflated),
+            ),
+        ),
+    )
+    own = (
+        Picture(
+            "Lung model in the CT",
+            "Tetrahedra that fill the segmented lung; planes through the nodule.",
+            case.ct,
+            case.nodule.centre_ras,
+            (Outline("lung model", LUNG, _outer(result.lung_ct)),),
+        ),
+        Picture(
+            "Contact surface in the deflated CBCT",
+            "What the collapsing lung may not pass.",
+            case.cbct_deflated,
+            result.nodule_deflated_ras,
+            (Outline("contact surface", MESH, result.contact_surface),),
+        ),
+    )
+    depth, nearest = depth_below(result.deflated_surface, result.nodule_deflated_ras)
+    return ReportData(
+        case.folder.resolve().name, result.run.as_json(), nodule, phases, (*own, *pictures), depth, nearest
+    )
+
+
+def depth_below(surface: Surface, point_ras: Array) -> tuple[float | None, Array | None]:
+    """Distance of a point (3,) below a surface with outward triangles, mm, negative outside, and the foot (3,) RAS mm.
+
+    Both are None for a surface without triangles.
+    """
+    if not len(surface.triangles):
+        return None, None
+    nodes = np.arange(len(surface.points_ras))
+    near = closest_points(TriSurface(surface.points_ras, surface.triangles, nodes), np.reshape(point_ras, (1, 3)))
+    return -float(near.distance[0]), near.points[0]
+
+
+def _ellipsoid(run: RunRecord) -> Array | None:
+    axes = run.details.get("nodule_ellipsoid95_axes_lps")
+    if axes is None:
+        return None
+    return flip_points(np.asarray(axes, dtype=float)) * np.asarray(run.nodule_ellipsoid95_mm, dtype=float)[:, None]
+
+
+def _outer(lung: TetraMesh) -> Surface:
+    boundary = TetMesh(lung.points_ras, lung.tets).boundary
+    return Surface(boundary.points, boundary.triangles)
