@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from phantoms.fields import Lattice, as_distance, lattice_over, smoothstep, soft_max
+from phantoms.fields import Lattice, as_distance, lattice_over, near_distance, smoothstep, soft_max
 
 Array = NDArray[Any]
 
@@ -100,11 +100,11 @@ def make_shapes(build: Build, spacing: float = 3.0) -> Shapes:
     return Shapes(
         build=build,
         body=as_distance(lattice, _body(build, x, y, z)),
-        cage=as_distance(lattice, cage),
+        cage=near_distance(lattice, cage),
         right_lung=lungs[0],
         left_lung=lungs[1],
-        heart=as_distance(lattice, heart),
-        below_diaphragm=as_distance(lattice, -diaphragm),
+        heart=near_distance(lattice, heart),
+        below_diaphragm=near_distance(lattice, -diaphragm),
     )
 
 

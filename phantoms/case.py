@@ -14,7 +14,6 @@ from phantoms.cage import CageMotion, fit_dome
 from phantoms.cbct import Scanner, expose, scanner_grid
 from phantoms.fields import Lattice, coverage, smooth_noise
 from phantoms.imaging import Picture, State, image_state, nodule_mask
-from phantoms.spline import SplineMap
 from phantoms.thorax import NODULE_HU, Thorax, ct_grid, draw_lung_trees, draw_thorax, image_body
 from phantoms.tissue import Equilibrium, Hilum, Pleura, Tissue, pleura_points, relax, tissue_points
 from registration.volume import Grid, Mask, Volume
@@ -25,7 +24,8 @@ Array = NDArray[Any]
 @dataclass(frozen=True)
 class PhantomSpec:
     """What to make. side: operated; ct_spacing, cbct_spacing: mm; inflated, deflated: lung volume over that in the CT;
-    dome_rise: mm the diaphragm rises further when the lung collapses; nodule_depth, nodule_radius: mm."""
+    dome_rise: mm the diaphragm rises further when the lung collapses; element: mm between nodes of the
+    lung's map; nodule_depth, nodule_radius: mm."""
 
     name: str
     side: str
@@ -35,12 +35,13 @@ class PhantomSpec:
     inflated: float = 0.86
     deflated: float = 0.52
     dome_rise: float = 8.0
+    element: float = 15.0
     nodule_depth: float = 15.0
     nodule_radius: float = 8.0
     scanner: Scanner = field(default_factory=Scanner)
 
 
-_SMALL = PhantomSpec("small", "right", (1.5, 1.5, 2.0), (1.5, 1.5, 1.5))
+_SMALL = PhantomSpec("small", "right", (1.5, 1.5, 2.0), (1.5, 1.5, 1.5), element=18.0)
 SPECS = {
     s.name: s
     for s in (
@@ -145,35 +146,28 @@ def _states(
     )
     gravity = np.array([-sign, 0.15, 0.05]) + rng.normal(0, 0.03, 3)
     gravity /= np.linalg.norm(gravity)
-    points, volume = tissue_points(lung, 7.5)
+    points, volume = tissue_points(lung, spec.element / 2)
     surface, area = pleura_points(lung, 2)
     hilum = thorax.hila[thorax.index(spec.side)]
     tied = points[np.linalg.norm(points - hilum, axis=1) < 20]
     shear, slack = _uneven(thorax, lung, points, hilum, rng)
+    rest = np.cbrt(np.clip(spec.deflated * slack, 0.15, 0.95))
     poses = _poses(_centre(thorax), rng)
     states, ends = [], []
     for motion, held, pose in ((inflated_motion, True, poses[0]), (deflated_motion, False, poses[1])):
         cavity = motion.carry(lung)
-        share = spec.deflated
-        end: Equilibrium | None = None
-        for _ in range(1 if held else 3):
-            rest = np.cbrt(np.clip(share * slack, 0.15, 0.95))
-            end = relax(
-                Tissue(points, volume, shear, rest, 165.0),
-                Pleura(surface, area, cavity, held),
-                Hilum(tied, motion(tied), 300.0),
-                gravity,
-                motion if end is None else end.state_from_ct,
-            )
-            share *= 1.0 if held else spec.deflated / _ratio(end.state_from_ct, points, volume)
-        assert end is not None
+        end = relax(
+            Tissue(points, volume, shear, rest, 165.0),
+            Pleura(surface, area, cavity, held),
+            Hilum(tied, motion(tied), 300.0),
+            gravity,
+            motion,
+            None if held else spec.deflated,
+            spec.element,
+        )
         ends.append(end)
         states.append(State(lung, cavity, motion, end.state_from_ct, held, pose, points))
     return (states[0], states[1]), gravity, ends
-
-
-def _ratio(lung_map: SplineMap, points: Array, volume: Array) -> float:
-    return float(lung_map.determinant(points) @ volume / volume.sum())
 
 
 def _uneven(

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from phantoms.fields import smoothstep
+from phantoms.fields import refine, smoothstep
 from registration.volume import Grid, Volume
 
 Array = NDArray[Any]
@@ -62,6 +62,6 @@ def _grain(grid: Grid, rng: np.random.Generator) -> Array:
     """Noise of unit variance, finer across the slices than along, with a weak coarse part."""
     white = rng.standard_normal(grid.shape, dtype=np.float32)
     fine = ndimage.gaussian_filter(white, 0.75 / grid.spacing, truncate=3)
-    small = rng.standard_normal([n // 6 + 2 for n in grid.shape]).astype(np.float32)
-    coarse = ndimage.zoom(small, 6, order=1)[: grid.shape[0], : grid.shape[1], : grid.shape[2]]
+    small = rng.standard_normal([n // 6 + 2 for n in grid.shape], dtype=np.float32)
+    coarse = refine(small, 6, grid.shape)
     return 0.95 * fine / fine.std() + 0.3 * coarse / coarse.std()

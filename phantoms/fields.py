@@ -123,12 +123,17 @@ def coverage(distance: Array, width_mm: float) -> Array:
     return np.clip(0.5 - distance / width_mm, 0, 1)
 
 
+def near_distance(lattice: Lattice, implicit: Array) -> Lattice:
+    """Signed distance (mm) to the zero level of an implicit function, negative inside; true near the level only."""
+    gx, gy, gz = np.gradient(implicit.astype(np.float32), lattice.spacing)
+    return lattice.like(implicit / np.sqrt(np.maximum(gx * gx + gy * gy + gz * gz, 0.04)))
+
+
 def as_distance(lattice: Lattice, implicit: Array) -> Lattice:
-    """Signed distance (mm) to the zero level of an implicit function, negative inside."""
+    """Signed distance (mm) to the zero level of an implicit function, negative inside; good everywhere."""
     h = lattice.spacing
-    gx, gy, gz = np.gradient(implicit, h)
-    near = implicit / np.maximum(np.sqrt(gx * gx + gy * gy + gz * gz), 0.2)
-    inside = implicit < 0
+    near = near_distance(lattice, implicit).values
+    inside = near < 0
     far = ndimage.distance_transform_edt(~inside, sampling=h) - ndimage.distance_transform_edt(inside, sampling=h)
     far -= np.sign(far) * h / 2
     trust = np.clip((np.abs(far) - h) / h, 0, 1)

@@ -64,7 +64,7 @@ def basis(points: Array, origin: Array, spacing: float, shape: tuple[int, int, i
     column = (nodes[0][:, :, None, None] * shape[1] + nodes[1][:, None, :, None]) * shape[2] + nodes[2][
         :, None, None, :
     ]
-    rows = np.repeat(np.arange(len(points) + 1) * 27, 1)
+    rows = np.arange(len(points) + 1) * 27
     size = (len(points), int(np.prod(shape)))
     matrices = []
     for d in (-1, 0, 1, 2):
@@ -74,9 +74,20 @@ def basis(points: Array, origin: Array, spacing: float, shape: tuple[int, int, i
     return matrices
 
 
+def cofactors(f: Array) -> Array:
+    """Cofactor matrices det(F) F^-T of matrices F (n, 3, 3)."""
+    out = np.empty_like(f)
+    for m in range(3):
+        p, q = f[:, (m + 1) % 3], f[:, (m + 2) % 3]
+        for n in range(3):
+            i, j = (n + 1) % 3, (n + 2) % 3
+            out[:, m, n] = p[:, i] * q[:, j] - p[:, j] * q[:, i]
+    return out
+
+
 def determinant(f: Array) -> Array:
     """Determinants of matrices (n, 3, 3)."""
-    return np.einsum("ni,ni->n", f[:, 0], np.cross(f[:, 1], f[:, 2]))
+    return np.asarray((f[:, 0] * cofactors(f)[:, 0]).sum(axis=1))
 
 
 @numba.njit(cache=True)

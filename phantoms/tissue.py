@@ -9,7 +9,7 @@ Ref: Bonet and Wood 2008, eq. 6.27 (the tissue); Liu 2017 (quasi-Newton steps in
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any
 
@@ -20,7 +20,7 @@ from scipy.sparse.linalg import splu
 from skimage.measure import marching_cubes
 
 from phantoms.fields import Lattice
-from phantoms.spline import SplineMap, basis, determinant
+from phantoms.spline import SplineMap, basis, cofactors, determinant
 
 Array = NDArray[Any]
 
@@ -100,15 +100,28 @@ def relax(
     hilum: Hilum,
     gravity: Array,
     guess: Callable[[Array], Array],
-    spacing_mm: float = 15.0,
+    volume_ratio: float | None,
+    spacing_mm: float,
 ) -> Equilibrium:
-    """Equilibrium of the lung; gravity: (3,) unit vector; guess: CT points to the state, for the start."""
+    """Equilibrium of the lung on a spline of `spacing_mm`, from the start that maps CT points by `guess`.
+
+    gravity: (3,) unit vector; volume_ratio: volume over that in the CT, met by scaling the rest shape; None leaves it.
+    """
     low, high = tissue.points.min(axis=0) - 2.5 * spacing_mm, tissue.points.max(axis=0) + 2.5 * spacing_mm
     nx, ny, nz = (int(n) for n in np.ceil((high - low) / spacing_mm) + 1)
     problem = _Problem(tissue, pleura, hilum, gravity, low, spacing_mm, (nx, ny, nz))
-    start = problem.fit(guess)
-    u, status, history = _minimize(problem, start)
-    return Equilibrium(SplineMap(problem.full(u), low, spacing_mm), status, history)
+    u = problem.fit(guess)
+    histories: list[Array] = []
+    for _ in range(4):
+        u, status, history = _minimize(problem, u, histories[0][0] if histories else None)
+        histories.append(history)
+        ratio = problem.volume(u) / float(tissue.volume.sum())
+        if volume_ratio is None or abs(ratio / volume_ratio - 1) < 3e-3:
+            break
+        rest = problem.tissue.rest * np.cbrt(volume_ratio / ratio)
+        problem.tissue = replace(problem.tissue, rest=np.clip(rest, 0.5, 0.99))
+    forces = np.concatenate(histories)
+    return Equilibrium(SplineMap(problem.full(u), low, spacing_mm), status, forces / forces[0])
 
 
 class _Problem:
@@ -141,7 +154,6 @@ class _Problem:
         touch = self.on_pleura.T @ (self.on_pleura * (self.contact / 3)[:, None])
         tie = self.on_hilum.T @ (self.on_hilum * hilum.stiffness)
         self.metric = splu(sparse.csc_array(laplace + touch + tie))
-        self.scale = float(np.abs(self.load).sum())
 
     def _roughness(self, spacing: float) -> sparse.csr_array:
         """Bending of the coefficients: it carries the map smoothly a little way beyond the pleura."""
@@ -178,20 +190,23 @@ class _Problem:
         )
         return np.ascontiguousarray(out.reshape(*self.shape, 3)[tuple(nearest)])
 
+    def volume(self, u: Array) -> float:
+        """Volume of the lung in mm3."""
+        f = np.stack([s @ u for s in self.slopes], axis=-1) + np.eye(3)
+        return float(self.tissue.volume @ determinant(f))
+
     def energy(self, u: Array) -> tuple[float, Array]:
         """Energy (kPa mm3) and its gradient (n, 3); infinite where an element is turned inside out."""
         t = self.tissue
         f = np.stack([s @ u for s in self.slopes], axis=-1) + np.eye(3)
-        j = determinant(f)
+        cofactor = cofactors(f)
+        j = (f[:, 0] * cofactor[:, 0]).sum(axis=1)
         if j.min() <= 0:
             return np.inf, np.zeros_like(u)
         g = f / t.rest[:, None, None]
         log_j = np.log(j / t.rest**3)
         rest_volume = t.volume * t.rest**3
         w = t.shear / 2 * (np.einsum("nij,nij->n", g, g) - 3 - 2 * log_j) + self.lame / 2 * log_j**2
-        cofactor = np.stack(
-            [np.cross(f[:, 1], f[:, 2]), np.cross(f[:, 2], f[:, 0]), np.cross(f[:, 0], f[:, 1])], axis=1
-        )
         inverse_t = cofactor / j[:, None, None]
         stress = (t.shear / t.rest**2)[:, None, None] * f + ((self.lame * log_j - t.shear)[:, None, None]) * inverse_t
         stress *= rest_volume[:, None, None]
@@ -211,43 +226,36 @@ class _Problem:
         return total, gradient + self.hilum.stiffness * (self.on_hilum.T @ pull)
 
 
-def _minimize(problem: _Problem, u: Array, steps: int = 220, limit: float = 2e-3) -> tuple[Array, Status, Array]:
-    """Limited-memory BFGS in the problem's metric; force is measured as the metric's norm of the next step."""
+def _minimize(
+    problem: _Problem, u: Array, first_force: float | None, steps: int = 150, limit: float = 1e-2
+) -> tuple[Array, Status, Array]:
+    """Limited-memory BFGS in the problem's metric until the force, that metric's norm of the next step, is small."""
     value, gradient = problem.energy(u)
     if not np.isfinite(value):
         raise ValueError("the lung is folded at the start, reduce the motion of the cage")
     memory: list[tuple[Array, Array, float]] = []
     history: list[float] = []
-    status = Status.STEPS
-    for _ in range(steps):
+    while len(history) < steps:
         step = _two_loop(problem, gradient, memory)
         slope = float((step * gradient).sum())
-        if slope >= 0:
-            memory.clear()
-            step = -problem.metric.solve(gradient)
-            slope = float((step * gradient).sum())
-        history.append(float(np.sqrt(-slope)))
-        if history[-1] < limit * history[0]:
-            status = Status.CONVERGED
-            break
-        t, found = 1.0, (np.inf, gradient)
-        while t > 1e-4:
+        history.append(float(np.sqrt(max(-slope, 0.0))))
+        if history[-1] <= limit * (first_force or history[0]):
+            return u, Status.CONVERGED, np.array(history)
+        t, found = 1.0, problem.energy(u + step)
+        while found[0] > value + 1e-4 * t * slope and t > 1e-3:
+            t *= 0.4
             found = problem.energy(u + t * step)
-            if found[0] <= value + 1e-4 * t * slope:
-                break
-            t *= 0.5
-        else:
+        if found[0] >= value:
             if not memory:
-                status = Status.STALLED
-                break
-            memory.clear()
+                return u, Status.STALLED, np.array(history)
+            memory = []
             continue
         y, s = found[1] - gradient, t * step
         curvature = float((y * s).sum())
         if curvature > 0:
             memory = [*memory[-11:], (s, y, curvature)]
         u, (value, gradient) = u + s, found
-    return u, status, np.array(history) / max(history[0], 1e-300)
+    return u, Status.STEPS, np.array(history)
 
 
 def _two_loop(problem: _Problem, gradient: Array, memory: list[tuple[Array, Array, float]]) -> Array:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -109,25 +110,38 @@ def draw_tubes(share: Array, grid: Grid, ends: Array, radii: Array, width_mm: fl
 
     Tubes thinner than `width_mm`, the edge of a voxel, fill less than all of it.
     """
-    step = np.diag(grid.ras_from_ijk[:3, :3])
-    origin = grid.ras_from_ijk[:3, 3]
-    shape = np.array(grid.shape)
-    for (p, q), (rp, rq) in zip(ends, radii, strict=True):
-        reach = max(rp, rq) + width_mm / 2
-        corners = (np.array([np.minimum(p, q) - reach, np.maximum(p, q) + reach]) - origin) / step
-        lo = np.maximum(np.ceil(corners.min(axis=0)), 0).astype(int)
-        hi = np.minimum(np.floor(corners.max(axis=0)) + 1, shape).astype(int)
-        if np.any(hi <= lo):
-            continue
-        x, y, z = (origin[m] + step[m] * np.arange(lo[m], hi[m]) - p[m] for m in range(3))
-        d = q - p
-        dd = max(float(d @ d), 1e-12)
-        t = ((x * d[0])[:, None, None] + (y * d[1])[None, :, None] + (z * d[2])[None, None, :]) / dd
-        np.clip(t, 0, 1, out=t)
-        square = (
-            (x[:, None, None] - t * d[0]) ** 2 + (y[None, :, None] - t * d[1]) ** 2 + (z[None, None, :] - t * d[2]) ** 2
-        )
-        r = rp + t * (rq - rp)
-        fill = np.clip(0.5 - (np.sqrt(square) - r) / width_mm, 0, 1) * np.minimum(1, (2 * r / width_mm) ** 1.2)
-        box = share[lo[0] : hi[0], lo[1] : hi[1], lo[2] : hi[2]]
-        np.maximum(box, fill, out=box)
+    step = np.diag(grid.ras_from_ijk[:3, :3]).copy()
+    origin = grid.ras_from_ijk[:3, 3].copy()
+    _fill(
+        share, origin, step, np.ascontiguousarray(ends, dtype=float), np.ascontiguousarray(radii, dtype=float), width_mm
+    )
+
+
+@numba.njit(cache=True)
+def _fill(share, origin, step, ends, radii, width):
+    low, high = np.empty(3, dtype=np.int64), np.empty(3, dtype=np.int64)
+    for n in range(len(ends)):
+        p, q, rp, rq = ends[n, 0], ends[n, 1], radii[n, 0], radii[n, 1]
+        reach = max(rp, rq) + width / 2
+        dd = 1e-12
+        for m in range(3):
+            a = (min(p[m], q[m]) - reach - origin[m]) / step[m]
+            b = (max(p[m], q[m]) + reach - origin[m]) / step[m]
+            low[m] = max(int(np.ceil(min(a, b))), 0)
+            high[m] = min(int(np.floor(max(a, b))) + 1, share.shape[m])
+            dd += (q[m] - p[m]) ** 2
+        for i in range(low[0], high[0]):
+            x = origin[0] + step[0] * i - p[0]
+            for j in range(low[1], high[1]):
+                y = origin[1] + step[1] * j - p[1]
+                for k in range(low[2], high[2]):
+                    z = origin[2] + step[2] * k - p[2]
+                    t = (x * (q[0] - p[0]) + y * (q[1] - p[1]) + z * (q[2] - p[2])) / dd
+                    t = min(max(t, 0.0), 1.0)
+                    u, v, w = x - t * (q[0] - p[0]), y - t * (q[1] - p[1]), z - t * (q[2] - p[2])
+                    r = rp + t * (rq - rp)
+                    fill = 0.5 - (np.sqrt(u * u + v * v + w * w) - r) / width
+                    if fill > 0:
+                        fill = min(fill, 1.0) * min(1.0, (2 * r / width) ** 1.2)
+                        if fill > share[i, j, k]:
+                            share[i, j, k] = fill
