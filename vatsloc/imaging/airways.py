@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from scipy import ndimage
 
 from registration.volume import Array, Volume
-from vatsloc.imaging.lattice import _box
+from vatsloc.imaging.lattice import bounding_box, dilate, touching
 
 TUBE_AREA_MM2 = (50.0, 900.0)
 MOST_AIRWAY_ML = 120.0
@@ -59,7 +61,7 @@ def grow_airways(work: Volume, seed: Array) -> Array:
     if not seed.any():
         return seed.copy()
     margin = np.array([110.0, 80.0, 150.0]) / work.grid.spacing
-    box = _box(seed, margin)
+    box = bounding_box(seed, margin)
     hu, start = work.hu[box], seed[box]
     voxel_ml = float(work.grid.spacing.prod()) / 1000
     seed_ml = start.sum() * voxel_ml
@@ -76,4 +78,74 @@ def grow_airways(work: Volume, seed: Array) -> Array:
         tree, size = grown, ml
     out = np.zeros_like(seed)
     out[box] = tree
+    return out
+
+
+@dataclass(frozen=True)
+class TrackedAirways:
+    """Airways found again in a CBCT. inside: on the working grid; shift_mm: (3,) RAS move of the expected tree.
+
+    contrast_hu: wall minus lumen at the place found; the runner-up is the best place at least 8 mm away.
+    """
+
+    inside: Array
+    shift_mm: Array
+    contrast_hu: float
+    runner_up_hu: float
+
+
+def track_airways(work: Volume, seen: Array, expected: Array, reach_mm: float = 20.0) -> TrackedAirways:
+    """The dark tubes of a CBCT near where the CT's airways are expected.
+
+    The expected tree is moved as a whole to where its lumen is darkest against its wall, over shifts up to `reach_mm`;
+    then dark voxels connected to it and not far from it are taken.
+    """
+    spacing = work.grid.spacing
+    nothing = TrackedAirways(np.zeros_like(expected), np.zeros(3), 0.0, 0.0)
+    if (expected & seen).sum() * spacing.prod() < 500.0:
+        return nothing
+    wall = dilate(expected, 4.5, spacing) & ~dilate(expected, 2.0, spacing)
+    lumen_ijk, wall_ijk = (np.argwhere(m & seen)[:: max(int((m & seen).sum() // 4000), 1)] for m in (expected, wall))
+    hu = np.where(seen, work.hu, np.float32(np.nan))
+    n = np.maximum(np.floor(reach_mm / (2 * spacing)), 1).astype(int) * 2
+    steps = np.stack(np.meshgrid(*[np.arange(-m, m + 1, 2) for m in n], indexing="ij"), -1).reshape(-1, 3)
+    steps = steps[np.linalg.norm(steps * spacing, axis=1) <= reach_mm]
+    score = _contrasts(hu, lumen_ijk, wall_ijk, steps)
+    first = steps[int(score.argmax())]
+    away = np.linalg.norm((steps - first) * spacing, axis=1) >= 8.0
+    near = first + np.stack(np.meshgrid(*[np.arange(-1, 2)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    fine = _contrasts(hu, lumen_ijk, wall_ijk, near)
+    best = near[int(fine.argmax())]
+    moved = _shifted(expected, best) & seen
+    region = dilate(moved, 5.0, spacing)
+    dark_level = float(np.median(work.hu[moved])) + 150.0 if moved.any() else -1000.0
+    dark = (work.hu < dark_level) & region
+    tubes = touching(dark, moved & dark)
+    shift_mm = work.grid.ras_from_ijk[:3, :3] @ best
+    runner_up = float(score[away].max()) if away.any() else 0.0
+    return TrackedAirways(tubes & seen, shift_mm, float(fine.max()), runner_up)
+
+
+def _contrasts(hu: Array, lumen_ijk: Array, wall_ijk: Array, steps: Array) -> Array:
+    """Mean wall minus mean lumen in HU for every shift (n, 3) in voxels; -inf where half of the tree is lost."""
+    out = np.full(len(steps), -np.inf)
+    for n, step in enumerate(steps):
+        means = []
+        for ijk in (lumen_ijk, wall_ijk):
+            at = ijk + step
+            at = at[((at >= 0) & (at < hu.shape)).all(axis=1)]
+            values = hu[tuple(at.T)]
+            values = values[np.isfinite(values)]
+            means.append(float(np.minimum(values, 0.0).mean()) if values.size > 0.5 * len(ijk) else np.nan)
+        if np.isfinite(means).all():
+            out[n] = means[1] - means[0]
+    return out
+
+
+def _shifted(inside: Array, step: Array) -> Array:
+    """`inside` moved by whole voxels, nothing wrapped round."""
+    out = np.zeros_like(inside)
+    to = tuple(slice(max(s, 0), n + min(s, 0)) for s, n in zip(step, inside.shape, strict=True))
+    back = tuple(slice(max(-s, 0), n + min(-s, 0)) for s, n in zip(step, inside.shape, strict=True))
+    out[to] = inside[back]
     return out

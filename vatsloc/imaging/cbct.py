@@ -19,7 +19,7 @@ SOFT_TISSUE_HU = 40.0
 class FieldOfView:
     """What the scanner saw. mask: inside the cylinder; usable: that without the bad end slices, on the image's grid.
 
-    centre_ij: (2,) of the axis in in-plane voxels; radius_mm: inf where the image has no rim; axis: voxel axis along it.
+    centre_ij: (2,) of its axis, in-plane voxels; radius_mm: inf where the image has no rim; axis: voxel axis along it.
     """
 
     mask: Mask
@@ -31,13 +31,15 @@ class FieldOfView:
 
 @dataclass(frozen=True)
 class Cupping:
-    """Circularly symmetric error of a CBCT, piece-wise linear in the radius.
+    """Circularly symmetric error of a CBCT, piece-wise linear in the radius, and the scale that was left.
 
-    radius_mm, hu: (m,) knots of what was subtracted; before, after: HU of "air", "lung" and "soft" tissue.
+    radius_mm, hu: (m,) knots of what was subtracted; gain: contrast between air and soft tissue as a share of 1040 HU,
+    which was divided out about soft tissue; before, after: HU of "air", "lung" and "soft" tissue (nan: not seen).
     """
 
     radius_mm: Array
     hu: Array
+    gain: float
     before: dict[str, float]
     after: dict[str, float]
 
@@ -56,15 +58,35 @@ class PreparedCbct:
 
 
 def prepare_cbct(cbct: Volume) -> PreparedCbct:
-    """Field of view, bad end slices and cupping of `cbct`, and the corrected image. Ref: Alvarez 2021, section 5."""
+    """Field of view, bad end slices and cupping of `cbct`, and the corrected image.
+
+    Beyond the paper, the contrast that scatter took is given back where air is seen, so that lung HU tells mass.
+    Ref: Alvarez 2021, section 5.
+    """
     field = field_of_view(cbct)
     radius = _radius_map(cbct, field)
-    removed = estimate_cupping(cbct, field, radius)
-    hu = cbct.hu - removed.at(radius).astype(np.float32)
+    usable = field.usable.inside
+    knots, profile = estimate_cupping(cbct, field)
+    hu = cbct.hu - np.interp(radius, knots, profile).astype(np.float32)
+    gain = _gain(hu[usable & (radius <= 0.85 * knots[-1])][::5])
+    hu = SOFT_TISSUE_HU + (hu - SOFT_TISSUE_HU) / np.float32(gain)
     hu = np.where(field.mask.inside, np.maximum(hu, -1024), np.float32(-1000)).astype(np.float32)
-    corrected = Volume(hu, cbct.ras_from_ijk)
-    after = tissue_hu(hu[field.usable.inside])
-    return PreparedCbct(corrected, field, Cupping(removed.radius_mm, removed.hu, removed.before, after))
+    removed = Cupping(knots, profile, gain, tissue_hu(cbct.hu[usable]), tissue_hu(hu[usable]))
+    return PreparedCbct(Volume(hu, cbct.ras_from_ijk), field, removed)
+
+
+def _gain(hu: Array) -> float:
+    """Contrast between air and soft tissue as a share of 1040 HU; 1 where fewer than 0.05 % of the voxels are air.
+
+    Air is what lies at least a tenth of the lung's contrast below the lung's peak.
+    """
+    peak = tissue_hu(hu)["lung"]
+    if np.isnan(peak):
+        return 1.0
+    airy = hu[hu < peak - 0.1 * (SOFT_TISSUE_HU - peak)]
+    if airy.size < 5e-4 * hu.size:
+        return 1.0
+    return float(np.clip((SOFT_TISSUE_HU - np.median(airy)) / (SOFT_TISSUE_HU + 1000.0), 0.6, 1.2))
 
 
 def field_of_view(cbct: Volume, end_slices_mm: float = END_SLICES_MM) -> FieldOfView:
@@ -136,29 +158,40 @@ def _radius_map(cbct: Volume, field: FieldOfView) -> Array:
     return np.expand_dims(np.hypot((i - field.centre_ij[0]) * s0, (j - field.centre_ij[1]) * s1), field.axis)
 
 
-def estimate_cupping(cbct: Volume, field: FieldOfView, radius: Array) -> Cupping:
-    """Radial error of soft tissue: the ridge of its HU histogram over the radius, followed from ring to ring.
+def estimate_cupping(cbct: Volume, field: FieldOfView) -> tuple[Array, Array]:
+    """Knots in mm and HU (m,) of the radial error: the peak of lean tissue beside that of fat, followed over rings.
 
-    The profile is zero where soft tissue reads 40 HU, so that it also carries a constant offset.
+    The profile is zero where lean tissue reads 40 HU, so that it also carries a constant offset.
     """
-    usable = field.usable.inside
+    usable, radius = field.usable.inside, _radius_map(cbct, field)
     hu = ndimage.uniform_filter(cbct.hu, 3)[usable][::3]
     r = np.broadcast_to(radius, usable.shape)[usable][::3]
-    outer = float(r.max())
-    before = tissue_hu(cbct.hu[usable][::3])
-    rings = np.linspace(0.0, outer, 31)
-    levels = np.arange(-200.0, 241.0, 8.0)
-    table = np.histogram2d(r, hu, bins=(rings, levels))[0]
-    table = ndimage.gaussian_filter(table, (0.7, 1.5))
+    rings = np.linspace(0.0, float(r.max()), 31)
+    levels = np.arange(-320.0, 241.0, 8.0)
+    table = ndimage.gaussian_filter(np.histogram2d(r, hu, bins=(rings, levels))[0], (0.7, 0.7))
     weight = table.sum(axis=1)
-    score = (
-        np.sqrt(table / np.maximum(table.max(axis=1, keepdims=True), 1.0)) * np.minimum(weight / 200.0, 1.0)[:, None]
-    )
-    ridge = _ridge(score, steepest=4) * 8.0 + levels[0] + 4.0
+    shift = np.arange(-180.0, 181.0, 6.0)
+    score = _lean_and_fat(table / np.maximum(weight[:, None], 1.0), (levels[:-1] + levels[1:]) / 2, shift)
+    ridge = shift[_ridge(score * np.minimum(weight / 200.0, 1.0)[:, None], steepest=4)]
     centres = (rings[:-1] + rings[1:]) / 2
-    knots = np.linspace(0.0, outer, round(1 / KNOT_STEP) + 1)
-    fitted = _piecewise_linear(centres, ridge - SOFT_TISSUE_HU, np.sqrt(weight), knots)
-    return Cupping(knots, fitted, before, before)
+    knots = np.linspace(0.0, float(r.max()), round(1 / KNOT_STEP) + 1)
+    return knots, _piecewise_linear(centres, ridge - SOFT_TISSUE_HU, np.sqrt(weight), knots)
+
+
+def _lean_and_fat(share: Array, level: Array, shift: Array) -> Array:
+    """Log-likelihood (rings, shifts) of each ring's histogram when its lean tissue peaks at `shift`.
+
+    Fat lies about 105 HU lower in scatter-laden images; its share of a ring is free, little of it preferred.
+    """
+
+    def bell(at: Array) -> Array:
+        return np.exp(-0.5 * ((level[None] - at[:, None]) / 32.0) ** 2) / (32.0 * np.sqrt(2 * np.pi))
+
+    lean, fat = bell(shift), bell(shift - 105.0)
+    options = [
+        share @ np.log(0.15 / 560.0 + 0.85 * ((1 - w) * lean + w * fat)).T - 0.15 * w for w in (0.0, 0.25, 0.5, 0.75)
+    ]
+    return np.max(options, axis=0)
 
 
 def _ridge(score: Array, steepest: int) -> Array:
@@ -175,7 +208,7 @@ def _ridge(score: Array, steepest: int) -> Array:
         lo = max(path[-1] - steepest, 0)
         window = values[lo : path[-1] + steepest + 1]
         path.append(lo + int((window - 0.05 * np.abs(np.arange(lo, lo + window.size) - path[-1])).argmax()))
-    return np.array(path[::-1], dtype=float)
+    return np.array(path[::-1])
 
 
 def _piecewise_linear(x: Array, y: Array, weight: Array, knots: Array) -> Array:

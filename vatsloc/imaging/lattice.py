@@ -51,22 +51,30 @@ def on_grid(inside: Array, source: Grid, target: Grid, smooth_mm: float = 0.0) -
     if smooth_mm > 0:
         membership = ndimage.gaussian_filter(membership, smooth_mm / source.spacing, mode="nearest")
     out = np.zeros(target.shape, dtype=bool)
-    found = np.argwhere(inside)
-    if len(found):
-        lower, upper = found.min(axis=0) - 2.0, found.max(axis=0) + 2.0
+    if inside.any():
+        box = bounding_box(inside, np.full(3, 2))
+        lower, upper = np.array([[b.start - 2.0, b.stop + 1.0] for b in box]).T
         corners = lower + np.array([[a, b, c] for a in (0, 1) for b in (0, 1) for c in (0, 1)]) * (upper - lower)
         ijk = target.to_ijk(source.to_ras(corners))
         lo = np.clip(np.floor(ijk.min(axis=0)), 0, target.shape).astype(int)
         part = target.box(lo, np.maximum(ijk.max(axis=0) + 1, lo))
         step = source.ijk_from_ras @ part.ras_from_ijk
+        linear = step[:3, :3]
+        aligned = np.allclose(linear, np.diag(np.diag(linear)))
         value = ndimage.affine_transform(
-            membership, step[:3, :3], step[:3, 3], part.shape, order=1, mode="constant", prefilter=False
+            membership,
+            np.diag(linear) if aligned else linear,
+            step[:3, 3],
+            part.shape,
+            order=1,
+            mode="constant",
+            prefilter=False,
         )
         out[tuple(slice(a, a + n) for a, n in zip(lo, part.shape, strict=True))] = value >= 0.5
     return Mask(out, target.ras_from_ijk)
 
 
-def _box(inside: Array, margin: Array) -> tuple[slice, slice, slice]:
+def bounding_box(inside: Array, margin: Array) -> tuple[slice, slice, slice]:
     """Slices around the true voxels, `margin` voxels wider, clipped to the array."""
     found = [np.flatnonzero(inside.any(axis=tuple(m for m in range(3) if m != axis))) for axis in range(3)]
     lo = [max(int(f[0]) - int(g), 0) for f, g in zip(found, margin, strict=True)]
@@ -78,7 +86,7 @@ def dilate(inside: Array, radius_mm: float, spacing: Array) -> Array:
     """Voxels within `radius_mm` of `inside` (a ball, voxels `spacing` mm wide)."""
     if not inside.any():
         return inside.copy()
-    box = _box(inside, np.ceil(radius_mm / spacing) + 1)
+    box = bounding_box(inside, np.ceil(radius_mm / spacing) + 1)
     out = np.zeros_like(inside)
     out[box] = ndimage.distance_transform_edt(~inside[box], sampling=spacing) <= radius_mm
     return out
@@ -88,7 +96,7 @@ def erode(inside: Array, radius_mm: float, spacing: Array) -> Array:
     """Voxels farther than `radius_mm` from everything outside; the image's border does not erode."""
     if not inside.any() or inside.all():
         return inside.copy()
-    box = _box(inside, np.ceil(radius_mm / spacing) + 1)
+    box = bounding_box(inside, np.ceil(radius_mm / spacing) + 1)
     out = np.zeros_like(inside)
     out[box] = ndimage.distance_transform_edt(inside[box], sampling=spacing) > radius_mm
     return out

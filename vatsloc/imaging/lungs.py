@@ -211,7 +211,7 @@ def _check_side(
     other = _other(side)
     if away[other] + 1.0 < away[side]:
         raise InputRefused(
-            f"The nodule lies in the {other} lung, {away[side]:.0f} mm from the {side} one, which the case operates on; "
+            f"The nodule lies in the {other} lung, {away[side]:.0f} mm from the {side} one, the operated one; "
             f'set side = "{other}" in case.toml, or mend the orientation of the CT.'
         )
     if away[side] > 15.0:

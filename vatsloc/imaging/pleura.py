@@ -1,0 +1,150 @@
+"""The collapsed lung in a deflated CBCT: pleural air, what is left of the lung, and how sure each is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+from registration.volume import Array, Grid, Mask, Volume
+from vatsloc.imaging.airways import TrackedAirways
+from vatsloc.imaging.cbct import PreparedCbct
+from vatsloc.imaging.lattice import close, dilate, erode, on_grid, working_copy
+from vatsloc.imaging.thorax import AERATED_HU, ThoraxPrior, lung_space, working_scene
+
+FINE_MM = 1.0
+SMOOTHING_MM = 0.8
+SHADING_MM = 12.0
+LEAST_AIR_ML = 20.0
+LEAST_CONTRAST_HU = 100.0
+AIR_PIECE_ML = 0.5
+LUNG_PIECE_ML = 5.0
+
+
+@dataclass(frozen=True)
+class Pneumothorax:
+    """What a deflated CBCT shows on the operated side, on one grid of about 1 mm.
+
+    air: pleural air, fissures included; lung: the collapsed lung; space: both together. limit_hu: level between them.
+    contrast_hu: lung minus air. is_collapsed: whether there is enough pleural air to trust a surface.
+    """
+
+    air: Mask
+    lung: Mask
+    space: Mask
+    image: Volume
+    limit_hu: float
+    contrast_hu: float
+    air_ml: float
+    lung_ml: float
+    airways: TrackedAirways
+
+    @property
+    def is_collapsed(self) -> bool:
+        """At least 20 ml of air that is 100 HU darker than the lung."""
+        return self.air_ml >= LEAST_AIR_ML and self.contrast_hu >= LEAST_CONTRAST_HU
+
+
+def find_pneumothorax(cbct: PreparedCbct, prior: ThoraxPrior) -> Pneumothorax:
+    """Pleural air and collapsed lung of the operated side. prior: the inflated lung in this CBCT's frame.
+
+    Without pleural air the result says so (`is_collapsed`) and the whole space is lung.
+    Ref: Alvarez 2021, section 7.1.1, where this is done by hand.
+    """
+    work, seen = working_scene(cbct)
+    space, airways = lung_space(work, seen, prior)
+    fine = working_copy(cbct.volume, FINE_MM)
+    fine = Volume(ndimage.gaussian_filter(fine.hu, SMOOTHING_MM / fine.grid.spacing), fine.ras_from_ijk)
+    near = on_grid(dilate(space, 2.5, work.grid.spacing), work.grid, fine.grid).inside
+    near &= on_grid(cbct.field.mask.inside, cbct.volume.grid, fine.grid).inside
+    aerated = near & (fine.hu < AERATED_HU)
+    limit, contrast = _air_limit(fine.hu[aerated][::7])
+    voxel_ml = float(fine.grid.spacing.prod()) / 1000
+    air = np.zeros(fine.grid.shape, dtype=bool)
+    if contrast >= LEAST_CONTRAST_HU:
+        tubes = on_grid(dilate(airways.inside, 4.0, work.grid.spacing), work.grid, fine.grid).inside
+        sure = _pleural(aerated & (fine.hu < limit - 0.25 * contrast), tubes, voxel_ml)
+        level, reach = _local_limit(work, space, on_grid(sure, fine.grid, work.grid).inside, limit, contrast)
+        close_by = on_grid(reach, work.grid, fine.grid).inside
+        dark = aerated & close_by & (fine.hu < _upsampled(level, work.grid, fine.grid))
+        air = _pleural(ndimage.uniform_filter(dark.astype(np.float32), 3) > 0.5, tubes, voxel_ml)
+    lung = _lung_beside(aerated, air, fine.grid, work.grid)
+    masks = [Mask(m, fine.ras_from_ijk) for m in (air, lung, air | lung)]
+    air_ml, lung_ml = (float(m.sum()) * voxel_ml for m in (air, lung))
+    return Pneumothorax(masks[0], masks[1], masks[2], fine, limit, contrast, air_ml, lung_ml, airways)
+
+
+def _air_limit(hu: Array) -> tuple[float, float]:
+    """HU half-way between pleural air and lung, and their distance: Otsu's two classes, then their peaks."""
+    counts, edges = np.histogram(hu, bins=np.arange(-1030.0, AERATED_HU, 5.0))
+    level = (edges[:-1] + edges[1:]) / 2
+    share = counts / max(int(counts.sum()), 1)
+    below = np.cumsum(share)
+    moment = np.cumsum(share * level)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        between = (moment[-1] * below - moment) ** 2 / (below * (1 - below))
+    cut = int(np.nan_to_num(between, posinf=0.0).argmax())
+    smooth = ndimage.gaussian_filter1d(counts.astype(float), 2.0)
+    dark, bright = level[: cut + 1], level[cut + 1 :]
+    if not counts[: cut + 1].any() or not counts[cut + 1 :].any():
+        return float(level[0]), 0.0
+    air, lung = float(dark[smooth[: cut + 1].argmax()]), float(bright[smooth[cut + 1 :].argmax()])
+    trough = smooth[(level > air) & (level < lung)]
+    if trough.size == 0 or trough.min() > 0.9 * min(smooth[level == air][0], smooth[level == lung][0]):
+        return (air + lung) / 2, 0.0
+    return (air + lung) / 2, lung - air
+
+
+def _local_limit(work: Volume, space: Array, sure: Array, limit: float, contrast: float) -> tuple[Array, Array]:
+    """Level between air and lung that follows the shading, and where air may be at all.
+
+    Half-way between the mean of sure air and the mean of what lies over 5 mm from it, each within about 25 mm; air may
+    be within 5 mm of sure air. Where there is neither, the global values hold.
+    """
+    spacing = work.grid.spacing
+    reach = dilate(sure, 5.0, spacing)
+    lung = space & ~reach & (work.hu < limit + 0.8 * contrast)
+    sums = []
+    for part, far in ((sure, limit - contrast / 2), (lung, limit + contrast / 2)):
+        weight = ndimage.gaussian_filter(part.astype(np.float32), SHADING_MM / spacing) + 0.01
+        total = (
+            ndimage.gaussian_filter(np.where(part, work.hu, 0).astype(np.float32), SHADING_MM / spacing) + 0.01 * far
+        )
+        sums.append(total / weight)
+    return (sums[0] + sums[1]) / 2, reach
+
+
+def _upsampled(values: Array, source: Grid, target: Grid) -> Array:
+    step = source.ijk_from_ras @ target.ras_from_ijk
+    return ndimage.affine_transform(values, np.diag(step[:3, :3]), step[:3, 3], target.shape, order=1, mode="nearest")
+
+
+def _pleural(dark: Array, tubes: Array, voxel_ml: float) -> Array:
+    """Dark pieces of at least 0.5 ml that are not airways."""
+    labels, count = ndimage.label(dark)
+    ml = np.bincount(labels.ravel(), minlength=count + 1) * voxel_ml
+    in_tubes = np.bincount(labels[tubes], minlength=count + 1) * voxel_ml
+    keep = (ml >= AIR_PIECE_ML) & (in_tubes < 0.5 * ml)
+    keep[0] = False
+    return keep[labels]
+
+
+def _lung_beside(aerated: Array, air: Array, fine: Grid, coarse: Grid) -> Array:
+    """Tissue of the space that is not air, without the thin blurred skin between air and wall.
+
+    Vessels and dense lung between air and aerated lung are closed by a 10 mm ball.
+    """
+    spacing = coarse.spacing
+    tissue = on_grid(aerated & ~air, fine, coarse).inside
+    gas = on_grid(air, fine, coarse).inside
+    core = erode(tissue, 2.5, spacing)
+    labels, count = ndimage.label(core)
+    ml = np.bincount(labels.ravel(), minlength=count + 1) * spacing.prod() / 1000
+    keep = ml >= LUNG_PIECE_ML / 4
+    keep[0] = False
+    lung = dilate(keep[labels], 4.5, spacing) & tissue
+    closed = ndimage.binary_fill_holes(close(lung | gas, 10.0, spacing)) & ~gas
+    body = closed & dilate(lung, 10.0, spacing)
+    body = body & dilate(erode(body, 2.5, spacing), 4.5, spacing)
+    return on_grid(body | lung, coarse, fine, smooth_mm=1.0).inside & ~air
