@@ -18,7 +18,7 @@ from scipy import ndimage
 from registration.resample import resample_mask
 from registration.volume import Array, Grid, Mask, Volume, axis_codes
 from vatsloc.errors import CaseError, InputRefused
-from vatsloc.formats.casefile import CaseFile, Triple, read_case_file
+from vatsloc.formats.casefile import CaseFile, PleuralGas, Side, Triple, read_case_file
 from vatsloc.formats.images import files_behind, read_mask, read_volume
 from vatsloc.formats.markups import PointList, read_points
 from vatsloc.formats.meshes import Surface, read_surface
@@ -56,18 +56,18 @@ class Hints:
 class Case:
     """Everything `localize` may know.
 
-    side: "right" or "left"; gravity_ras: unit (3,) in the CBCT's frame; pleural_gas: "air" or "co2"; input_sha256 and
-    stored_axes: by name of the input; warnings: sentences for the report.
+    side: of the operated lung; gravity_ras: unit (3,) in the CBCT's frame; input_sha256 and stored_axes: by name of the
+    input; warnings: sentences for the report.
     """
 
     folder: Path
-    side: str
+    side: Side
     ct: Volume
     cbct_inflated: Volume
     cbct_deflated: Volume
     nodule: Nodule
     gravity_ras: Array
-    pleural_gas: str
+    pleural_gas: PleuralGas
     hints: Hints
     input_sha256: Mapping[str, str]
     stored_axes: Mapping[str, str]
@@ -159,7 +159,7 @@ def _input_paths(folder: Path, file: CaseFile) -> dict[str, Path]:
     return paths
 
 
-def _gravity(side: str, stated: Triple | None) -> Array:
+def _gravity(side: Side, stated: Triple | None) -> Array:
     """Unit vector in RAS; by default from the operated side, which lies up, to the other one."""
     default = np.array([-1.0, 0.0, 0.0]) if side == "right" else np.array([1.0, 0.0, 0.0])
     if stated is None:

@@ -15,6 +15,8 @@ FILE_NAME = "case.toml"
 GRAVITY_LENGTH_TOLERANCE = 0.05
 """How far from 1 the length of gravity may be; components rounded to one digit stay within it."""
 
+Side = Literal["right", "left"]
+PleuralGas = Literal["air", "co2"]
 Coordinate = Annotated[float, Field(allow_inf_nan=False)]
 Triple = tuple[Coordinate, Coordinate, Coordinate]
 FileName = Annotated[str, Field(min_length=1)]
@@ -49,7 +51,7 @@ class Setup(_Table):
     """The operating table. gravity_cbct: direction of gravity in RAS of the CBCT, unit length."""
 
     gravity_cbct: Triple | None = None
-    pleural_gas: Literal["air", "co2"] = "air"
+    pleural_gas: PleuralGas = "air"
 
     @field_validator("gravity_cbct")
     @classmethod
@@ -89,7 +91,7 @@ class LandmarkFiles(_Table):
 class CaseFile(_Table):
     """The whole of case.toml."""
 
-    side: Literal["right", "left"]
+    side: Side
     images: ImageFiles
     nodule: NoduleFiles
     setup: Setup = Setup()
