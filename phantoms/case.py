@@ -25,17 +25,18 @@ Array = NDArray[Any]
 class PhantomSpec:
     """What to make. side: operated; ct_spacing, cbct_spacing: mm; inflated, deflated: lung volume over that in the CT;
     dome_rise: mm the diaphragm rises further when the lung collapses; element: mm between nodes of the
-    lung's map; nodule_depth, nodule_radius: mm."""
+    lung's map; patchiness: factor on how uneven the tissue is; nodule_depth, nodule_radius: mm."""
 
     name: str
     side: str
     ct_spacing: tuple[float, float, float] = (1.2, 1.2, 1.5)
     cbct_spacing: tuple[float, float, float] = (1.0, 1.0, 1.0)
     cbct_length: float = 170.0
-    inflated: float = 0.86
+    inflated: float = 0.87
     deflated: float = 0.52
     dome_rise: float = 8.0
     element: float = 15.0
+    patchiness: float = 1.0
     nodule_depth: float = 15.0
     nodule_radius: float = 8.0
     scanner: Scanner = field(default_factory=Scanner)
@@ -45,7 +46,7 @@ _SMALL = PhantomSpec("small", "right", (1.5, 1.5, 2.0), (1.5, 1.5, 1.5), element
 SPECS = {
     s.name: s
     for s in (
-        replace(_SMALL, name="demo"),
+        replace(_SMALL, name="demo", inflated=0.89, deflated=0.55, patchiness=0.6),
         replace(_SMALL, name="small-right"),
         replace(_SMALL, name="small-left", side="left"),
         PhantomSpec("right", "right"),
@@ -150,7 +151,7 @@ def _states(
     surface, area = pleura_points(lung, 2)
     hilum = thorax.hila[thorax.index(spec.side)]
     tied = points[np.linalg.norm(points - hilum, axis=1) < 20]
-    shear, slack = _uneven(thorax, lung, points, hilum, rng)
+    shear, slack = _uneven(thorax, lung, points, spec.patchiness, rng)
     rest = np.cbrt(np.clip(spec.deflated * slack, 0.15, 0.95))
     poses = _poses(_centre(thorax), rng)
     states, ends = [], []
@@ -171,11 +172,12 @@ def _states(
 
 
 def _uneven(
-    thorax: Thorax, lung: Lattice, points: Array, hilum: Array, rng: np.random.Generator
+    thorax: Thorax, lung: Lattice, points: Array, patchiness: float, rng: np.random.Generator
 ) -> tuple[Array, Array]:
     """Shear modulus (kPa) and factor on the rest volume at points: patchy tissue, a stiff root, a stiff nodule."""
-    shear = 0.4 * np.exp(0.45 * lung.like(smooth_noise(lung, 32.0, rng)).at(points))
-    slack = np.exp(0.22 * lung.like(smooth_noise(lung, 38.0, rng)).at(points))
+    hilum = thorax.hila[thorax.index(thorax.side)]
+    shear = 0.65 * np.exp(0.45 * patchiness * lung.like(smooth_noise(lung, 32.0, rng)).at(points))
+    slack = np.exp(0.22 * patchiness * lung.like(smooth_noise(lung, 38.0, rng)).at(points))
     shear *= 1 + 5 * np.exp(-((np.linalg.norm(points - hilum, axis=1) / 24) ** 2))
     lesion = coverage(thorax.nodule.distance(points), 8.0)
     return shear * (1 + 10 * lesion), slack + lesion * (1.6 - slack)
