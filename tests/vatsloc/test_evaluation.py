@@ -11,7 +11,7 @@ from registration.field import DisplacementField
 from registration.volume import Mask
 from vatsloc.errors import CaseError
 from vatsloc.evaluation.ellipsoid import in_ellipsoid
-from vatsloc.evaluation.inputs import MeshMap, depth_below_pleura, seen_in
+from vatsloc.evaluation.inputs import depth_below_pleura, seen_in
 from vatsloc.evaluation.landmarks import match
 from vatsloc.evaluation.statistics import by_depth, distances, signed_rank_p, summarize
 from vatsloc.evaluation.tre import RunMaps, target_registration_errors
@@ -108,16 +108,6 @@ def test_missing_truth_gives_no_error_but_a_prediction():
     assert np.isnan(errors.mm["phase2"]).all()
     assert_allclose(errors.mm["chain"], [2.0])
     assert_allclose(errors.inflated, [[1, 1, 1]])
-
-
-def test_mesh_map_is_the_affine_map_inside_and_the_surface_motion_outside():
-    mesh = tetrahedron()
-    a, b = np.array([[0.5, 0.1, 0], [0, 0.6, 0], [0.2, 0, 0.7]]), np.array([3.0, -2, 1])
-    carry = MeshMap(mesh, mesh.points @ a.T + b)
-    inside = np.array([[1.0, 2, 3]])
-    assert_allclose(carry(inside), inside @ a.T + b)
-    foot, outside = np.array([[2.0, 3, 0]]), np.array([[2.0, 3, -5]])
-    assert_allclose(carry(outside), outside + (foot @ a.T + b - foot))
 
 
 def test_depth_is_positive_inside_and_negative_outside():

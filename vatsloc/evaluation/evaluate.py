@@ -147,7 +147,7 @@ def _warnings(landmarks: LandmarkTriples, inside_fov: Array, inside_mesh: Array,
         (int((~inside_fov).sum()), f"of {n} landmarks lie outside a CBCT's field of view."),
         (
             int((~inside_mesh).sum()),
-            f"of {n} landmarks lie outside the lung model; they move as its nearest surface point does.",
+            f"of {n} landmarks lie outside the lung model; they follow the nearest point of its surface.",
         ),
         (
             int((~inside_field).sum()),

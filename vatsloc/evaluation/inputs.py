@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from poro.mesh import TetMesh, closest_points, interpolate, locate
+from poro.mesh import TetMesh, closest_points
 from registration.field import DisplacementField
 from registration.rigid import RigidTransform
 from registration.volume import Array, Mask
@@ -24,6 +24,7 @@ from vatsloc.formats.markups import read_points
 from vatsloc.formats.meshes import read_vtu
 from vatsloc.formats.transforms import read_tfm
 from vatsloc.imaging.cbct import field_of_view
+from vatsloc.maps import MeshMap
 from vatsloc.results import (
     DEFLATED_FROM_CT,
     INFLATED_FROM_CT,
@@ -36,22 +37,6 @@ from vatsloc.results import (
     RIGID_INFLATED_FROM_CT,
     read_run,
 )
-
-
-@dataclass(frozen=True)
-class MeshMap:
-    """Where nodes that move from `mesh` to `moved` (n, 3) mm carry a point, linear in each tetrahedron.
-
-    A point outside the mesh moves as the nearest point of its surface does.
-    """
-
-    mesh: TetMesh
-    moved: Array
-
-    def __call__(self, points_ras: Array) -> Array:
-        """Moved points (q, 3) mm."""
-        displacement = self.moved - self.mesh.points
-        return np.asarray(points_ras, dtype=float) + interpolate(locate(self.mesh, points_ras), displacement)
 
 
 @dataclass(frozen=True)
@@ -118,7 +103,7 @@ def read_result(folder: Path) -> Result:
             rigid_def_from_ct=rigid_def_from_inf @ rigid_inf_from_ct,
             rigid_def_from_inf=rigid_def_from_inf,
             inf_from_ct=read_field(folder / INFLATED_FROM_CT),
-            def_from_inf=MeshMap(lung_inflated, deflated.points_ras),
+            def_from_inf=MeshMap(lung_inflated, deflated.points_ras, rigid_def_from_inf),
             def_from_ct=def_from_ct,
         ),
         field=def_from_ct,

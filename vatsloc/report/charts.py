@@ -11,15 +11,15 @@ from markupsafe import Markup
 from registration.volume import Array
 
 BLUE, ORANGE, INK, FAINT = "#0072B2", "#D55E00", "#1b1f24", "#c9ced6"
-WIDTH, LABEL = 760, 210
+PLOT_WIDTH, BARS_WIDTH, LABEL = 760, 560, 200
 
 
 def bars(values: Mapping[str, float], unit: str, described_as: str) -> Markup:
     """Horizontal bars, one per name, value written at the end of each; `described_as` is what a screen reader says."""
     row = 24
-    svg = _svg(WIDTH, row * len(values) + 8, described_as)
+    svg = _svg(BARS_WIDTH, row * len(values) + 8, described_as)
     longest = max([*values.values(), 1e-9])
-    room = WIDTH - LABEL - 90
+    room = BARS_WIDTH - LABEL - 80
     for m, (name, value) in enumerate(values.items()):
         y = 4 + m * row
         _text(svg, LABEL - 8, y + 16, name, "end")
@@ -31,12 +31,12 @@ def bars(values: Mapping[str, float], unit: str, described_as: str) -> Markup:
 def box_plot(groups: Mapping[str, Array], described_as: str) -> Markup:
     """Errors (n,) mm per group: quartiles as a box, whiskers at 5 and 95 %, a dot per landmark, diamond mean."""
     row, top = 40, 10
-    svg = _svg(WIDTH, top + row * len(groups) + 34, described_as)
+    svg = _svg(PLOT_WIDTH, top + row * len(groups) + 34, described_as)
     finite = {name: np.asarray(e)[np.isfinite(e)] for name, e in groups.items()}
     longest = max([float(e.max()) for e in finite.values() if e.size] + [1.0])
     step = _nice_step(longest)
     end = step * np.ceil(longest / step)
-    scale = (WIDTH - LABEL - 20) / end
+    scale = (PLOT_WIDTH - LABEL - 20) / end
     bottom = top + row * len(groups)
     for tick in np.arange(0, end + step / 2, step):
         x = LABEL + tick * scale

@@ -41,6 +41,7 @@ _SHOWN = {
     "theta",
     "seconds",
     "peak_mb",
+    "peak_mb_by_stage",
     "skipped",
     "gates",
     "warnings",
