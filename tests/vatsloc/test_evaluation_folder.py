@@ -13,6 +13,7 @@ from poro.mesh import stuff
 from registration.field import sample_map
 from registration.rigid import RigidTransform
 from registration.volume import Grid, Mask, Volume
+from vatsloc.case import sha256
 from vatsloc.errors import CaseError, InputRefused
 from vatsloc.evaluation import evaluate_case, table
 from vatsloc.formats.markups import PointList, write_points
@@ -79,7 +80,8 @@ def write_result(result, grid, image):
     surface = Surface(deflated, np.array([[0, 1, 2]]))
     field = sample_map(inflated_from_ct, grid)
     chain = sample_map(lambda x: deflated_from_inflated(inflated_from_ct(x)), grid)
-    details = {"nodule_ellipsoid95_axes_lps": np.eye(3)}
+    digests = {"cbct_deflated": sha256(result.parent / "case" / "cbct_deflated.nii.gz")}
+    details = {"nodule_ellipsoid95_axes_lps": np.eye(3), "input_sha256": digests}
     run = RunRecord(
         "converged", flip_points(nodule), np.array([2.5, 1, 1]), {"phi": 0.5}, {"total": 1.0}, 1.0, details=details
     )
@@ -187,6 +189,17 @@ def test_landmarks_without_a_frame_are_refused(folders):
 def test_folder_that_is_no_result_is_refused(folders, tmp_path):
     with pytest.raises(CaseError, match="not a result of localize"):
         evaluate_case(folders[0], tmp_path)
+
+
+def test_result_of_another_case_is_refused(folders):
+    case, result = folders
+    other = Volume(
+        np.full((40, 40, 40), -400, dtype=np.float32) + np.arange(40, dtype=np.float32), np.diag([3.0, 3, 3, 1])
+    )
+    write_volume(case / "cbct_deflated.nii.gz", other)
+    with pytest.raises(CaseError, match="made from another image"):
+        evaluate_case(case, result)
+    assert not (result / "tre.json").exists()
 
 
 def test_lungs_of_two_runs_are_not_mixed(folders):

@@ -15,7 +15,15 @@ import numpy as np
 from poro.mesh import locate
 from registration.volume import Array
 from vatsloc.evaluation.ellipsoid import in_ellipsoid
-from vatsloc.evaluation.inputs import Result, Truth, depth_below_pleura, read_result, read_truth, seen_in
+from vatsloc.evaluation.inputs import (
+    Result,
+    Truth,
+    check_same_case,
+    depth_below_pleura,
+    read_result,
+    read_truth,
+    seen_in,
+)
 from vatsloc.evaluation.landmarks import LandmarkTriples
 from vatsloc.evaluation.statistics import by_depth, signed_rank_p, summarize
 from vatsloc.evaluation.tre import BEFORE, MEASURES, Errors, target_registration_errors
@@ -41,9 +49,12 @@ class Evaluation:
 def evaluate_case(case: Path, folder: Path) -> dict[str, Any]:
     """Score the result in `folder` with the landmarks of `case`; writes tre.csv and tre.json and fills in report.html.
 
-    Returns what tre.json holds. Raises CaseError and InputRefused as `read_truth` and `read_result` do.
+    Returns what tre.json holds. Raises CaseError when the two do not belong together, and as `read_truth` and
+    `read_result` do.
     """
-    scores = evaluate(read_truth(case), read_result(folder))
+    result = read_result(folder)
+    check_same_case(case, folder, result.run)
+    scores = evaluate(read_truth(case), result)
     write_whole(folder / "tre.csv", as_csv(scores))
     write_whole(folder / "tre.json", json.dumps(scores.summary, indent=1, allow_nan=False) + "\n")
     report = folder / REPORT

@@ -12,7 +12,7 @@ from poro.mesh import TetMesh, closest_points
 from registration.field import DisplacementField
 from registration.rigid import RigidTransform
 from registration.volume import Array, Mask
-from vatsloc.case import Landmarks, read_landmarks
+from vatsloc.case import Landmarks, read_landmarks, sha256
 from vatsloc.errors import CaseError, InputRefused
 from vatsloc.evaluation.landmarks import LandmarkTriples, match
 from vatsloc.evaluation.tre import RunMaps
@@ -112,6 +112,14 @@ def read_result(folder: Path) -> Result:
         nodule_inflated_ras=read_points(folder / NODULE_INFLATED).ras[0],
         nodule_deflated_ras=read_points(folder / NODULE_DEFLATED).ras[0],
     )
+
+
+def check_same_case(case: Path, folder: Path, run: dict[str, Any]) -> None:
+    """Raise CaseError when the result was made from another deflated CBCT than the case holds."""
+    made_from = run.get("input_sha256", {}).get("cbct_deflated")
+    image = case / read_case_file(case).images.cbct_deflated
+    if made_from is not None and sha256(image) != made_from:
+        raise CaseError(f"{folder} was made from another image than {image}; give the case that belongs to the result.")
 
 
 def depth_below_pleura(lung: TetMesh, points_ras: Array) -> Array:
