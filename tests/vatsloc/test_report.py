@@ -168,6 +168,13 @@ def test_banner_follows_gates_and_warnings(changes, level, words):
         assert gate["ok"] or gate["says"] in page
 
 
+@pytest.mark.parametrize(
+    ("lengths", "words"), [([2, 6.25, 4], "6.2 × 4.0 × 2.0 mm"), ([None] * 3, "not estimated"), (None, "not estimated")]
+)
+def test_ellipsoid_without_directions_still_has_a_size(lengths, words):
+    assert words in words_alone(nodule_ellipsoid95_mm=lengths)
+
+
 def test_words_of_the_run_cannot_become_markup():
     page = words_alone(warnings=["a </script><b>bold</b> claim"])
     assert "<b>bold" not in page

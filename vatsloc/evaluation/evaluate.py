@@ -125,13 +125,10 @@ def as_csv(scores: Evaluation) -> str:
 def _nodule(truth: Truth, result: Result) -> dict[str, Any]:
     """Distance of both predicted nodules to the truth, None where that is not known."""
     inf, deflated = truth.nodule.nodule_inflated_ras, truth.nodule.nodule_deflated_ras
-    contained = None
-    if deflated is not None and result.run.get("nodule_ellipsoid95_mm") is not None:
-        contained = in_ellipsoid(
-            flip_points(deflated - result.nodule_deflated_ras),
-            np.array(result.run["nodule_ellipsoid95_mm"]),
-            result.run.get("nodule_ellipsoid95_axes_lps"),
-        )
+    contained, semi_axes = None, result.run.get("nodule_ellipsoid95_mm")
+    if deflated is not None and semi_axes is not None and None not in semi_axes:
+        offset = flip_points(deflated - result.nodule_deflated_ras)
+        contained = in_ellipsoid(offset, np.array(semi_axes), result.run.get("nodule_ellipsoid95_axes_lps"))
     return {
         "nodule_inflated_mm": None if inf is None else float(np.linalg.norm(inf - result.nodule_inflated_ras)),
         "nodule_deflated_mm": None

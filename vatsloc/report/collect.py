@@ -86,10 +86,10 @@ def depth_below(surface: Surface, point_ras: Array) -> tuple[float | None, Array
 
 
 def _ellipsoid(run: RunRecord) -> Array | None:
-    axes = run.details.get("nodule_ellipsoid95_axes_lps")
-    if axes is None:
+    axes, length = run.details.get("nodule_ellipsoid95_axes_lps"), np.asarray(run.nodule_ellipsoid95_mm, dtype=float)
+    if axes is None or not np.isfinite(length).all():
         return None
-    return flip_points(np.asarray(axes, dtype=float)) * np.asarray(run.nodule_ellipsoid95_mm, dtype=float)[:, None]
+    return flip_points(np.asarray(axes, dtype=float)) * length[:, None]
 
 
 def _outer(lung: TetraMesh) -> Surface:

@@ -15,7 +15,7 @@ from markupsafe import Markup
 from registration.volume import Array, Grid
 from vatsloc.frames import flip_points
 from vatsloc.report.charts import bars, box_plot
-from vatsloc.report.data import NODULE, Comparison, Nodule, Outline, Picture, ReportData, TreSection
+from vatsloc.report.data import NODULE, Comparison, Outline, Picture, ReportData, TreSection
 from vatsloc.report.paint import as_bgr, draw_nodule, draw_outline, green_magenta, grey, jpeg
 from vatsloc.report.planes import AXES, EDGE_LETTERS, Plane, box_of, plane_through, sample
 from vatsloc.report.stack import stacks
@@ -78,7 +78,7 @@ def render(data: ReportData) -> str:
         nodule_ras=data.nodule.centre_ras,
         nodule_lps=flip_points(data.nodule.centre_ras),
         nearest_lps=None if data.nearest_surface_ras is None else flip_points(data.nearest_surface_ras),
-        semi_axes=_semi_axes(data.nodule),
+        semi_axes=_semi_axes(data),
         viewer=viewer,
         viewer_json=_script_json([s.as_json() for s in viewer]),
         phases=[(phase, _before_after(phase, data.window_hu)) for phase in data.phases],
@@ -169,10 +169,12 @@ def _planes(grid: Grid, at_ras: Array) -> list[Plane]:
     return [plane_through(name, at_ras, box, spacing) for name in AXES]
 
 
-def _semi_axes(nodule: Nodule) -> Array | None:
-    if nodule.ellipsoid is None:
-        return None
-    return np.sort(np.linalg.norm(nodule.ellipsoid, axis=1))[::-1]
+def _semi_axes(data: ReportData) -> list[float] | None:
+    """Semi-axes in mm, longest first, whether or not their directions are known."""
+    if data.nodule.ellipsoid is not None:
+        return sorted(np.linalg.norm(data.nodule.ellipsoid, axis=1).tolist(), reverse=True)
+    lengths = data.run.get("nodule_ellipsoid95_mm")
+    return None if lengths is None or None in lengths else sorted(lengths, reverse=True)
 
 
 def _legend(data: ReportData) -> list[Outline]:
