@@ -113,15 +113,16 @@ def track_airways(work: Volume, seen: Array, expected: Array, reach_mm: float = 
     score = _contrasts(hu, lumen_ijk, wall_ijk, steps)
     first = steps[int(score.argmax())]
     away = np.linalg.norm((steps - first) * spacing, axis=1) >= 8.0
-    near = first + np.stack(np.meshgrid(*[np.arange(-1, 2)] * 3, indexing="ij"), -1).reshape(-1, 3)
-    fine = _contrasts(hu, lumen_ijk, wall_ijk, near)
-    best = near[int(fine.argmax())]
+    near = first + np.stack(np.meshgrid(*[np.arange(-2, 3)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    fine = _contrasts(hu, lumen_ijk, wall_ijk, near).reshape(5, 5, 5)
+    peak = np.unravel_index(int(fine.argmax()), fine.shape)
+    best = first + np.array(peak) - 2
     moved = _shifted(expected, best) & seen
     region = dilate(moved, 5.0, spacing)
     dark_level = float(np.median(work.hu[moved])) + 150.0 if moved.any() else -1000.0
     dark = (work.hu < dark_level) & region
     tubes = touching(dark, moved & dark)
-    shift_mm = work.grid.ras_from_ijk[:3, :3] @ best
+    shift_mm = work.grid.ras_from_ijk[:3, :3] @ (best + _between_voxels(fine, peak))
     runner_up = float(score[away].max()) if away.any() else 0.0
     return TrackedAirways(tubes & seen, shift_mm, float(fine.max()), runner_up)
 
@@ -149,3 +150,15 @@ def _shifted(inside: Array, step: Array) -> Array:
     back = tuple(slice(max(-s, 0), n + min(-s, 0)) for s, n in zip(step, inside.shape, strict=True))
     out[to] = inside[back]
     return out
+
+
+def _between_voxels(score: Array, peak: tuple[int, ...]) -> Array:
+    """Offset (3,) in voxels from the best sample to the top of the parabola through its neighbours on each axis."""
+    offset = np.zeros(3)
+    for axis in range(3):
+        line = np.moveaxis(score, axis, 0)[(slice(None), *[p for m, p in enumerate(peak) if m != axis])]
+        p = peak[axis]
+        if 0 < p < len(line) - 1 and np.isfinite(line[p - 1 : p + 2]).all():
+            bend = line[p - 1] - 2 * line[p] + line[p + 1]
+            offset[axis] = 0.5 * (line[p - 1] - line[p + 1]) / bend if bend < 0 else 0.0
+    return np.clip(offset, -0.5, 0.5)

@@ -6,11 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy import ndimage
+from skimage.segmentation import watershed
 
 from registration.volume import Array, Grid, Mask, Volume
 from vatsloc.imaging.airways import TrackedAirways
 from vatsloc.imaging.cbct import PreparedCbct
-from vatsloc.imaging.lattice import close, dilate, erode, on_grid, working_copy
+from vatsloc.imaging.lattice import bounding_box, close, dilate, erode, on_grid, working_copy
 from vatsloc.imaging.thorax import AERATED_HU, ThoraxPrior, lung_space, working_scene
 
 FINE_MM = 1.0
@@ -64,11 +65,13 @@ def find_pneumothorax(cbct: PreparedCbct, prior: ThoraxPrior) -> Pneumothorax:
     air = np.zeros(fine.grid.shape, dtype=bool)
     if contrast >= LEAST_CONTRAST_HU:
         tubes = on_grid(dilate(airways.inside, 4.0, work.grid.spacing), work.grid, fine.grid).inside
-        sure = _pleural(aerated & (fine.hu < limit - 0.25 * contrast), tubes, voxel_ml)
-        level, reach = _local_limit(work, space, on_grid(sure, fine.grid, work.grid).inside, limit, contrast)
-        close_by = on_grid(reach, work.grid, fine.grid).inside
-        dark = aerated & close_by & (fine.hu < _upsampled(level, work.grid, fine.grid))
-        air = _pleural(ndimage.uniform_filter(dark.astype(np.float32), 3) > 0.5, tubes, voxel_ml)
+        sure = _pleural(aerated & (fine.hu < limit - 0.4 * contrast), tubes, voxel_ml)
+        coarse = _flooded(work, space, on_grid(sure, fine.grid, work.grid).inside, limit)
+        level = _upsampled(_local_limit(work, space, coarse, limit, contrast), work.grid, fine.grid)
+        core, reach = erode(coarse, 1.5, work.grid.spacing), dilate(coarse, 2.5, work.grid.spacing)
+        dark = (fine.hu < level) & on_grid(reach, work.grid, fine.grid).inside
+        dark |= on_grid(core, work.grid, fine.grid).inside
+        air = _pleural(ndimage.uniform_filter((aerated & dark).astype(np.float32), 3) > 0.5, tubes, voxel_ml)
     lung = _lung_beside(aerated, air, fine.grid, work.grid)
     masks = [Mask(m, fine.ras_from_ijk) for m in (air, lung, air | lung)]
     air_ml, lung_ml = (float(m.sum()) * voxel_ml for m in (air, lung))
@@ -96,23 +99,33 @@ def _air_limit(hu: Array) -> tuple[float, float]:
     return (air + lung) / 2, lung - air
 
 
-def _local_limit(work: Volume, space: Array, sure: Array, limit: float, contrast: float) -> tuple[Array, Array]:
-    """Level between air and lung that follows the shading, and where air may be at all.
+def _flooded(work: Volume, space: Array, sure: Array, limit: float) -> Array:
+    """Air on the working grid: what lies between sure air and sure lung goes to either along the steepest edge.
 
-    Half-way between the mean of sure air and the mean of what lies over 5 mm from it, each within about 25 mm; air may
-    be within 5 mm of sure air. Where there is neither, the global values hold.
+    Shading shifts HU slowly, so that an edge tells better than a level. Ref: Vincent & Soille 1991.
     """
+    box = bounding_box(space, np.full(3, 2))
+    hu = ndimage.gaussian_filter(np.clip(work.hu[box], -1024, AERATED_HU), 0.4)
+    edge = ndimage.gaussian_gradient_magnitude(hu, 0.6)
+    markers = np.where(sure[box], 1, np.where(space[box] & (hu > limit), 2, 0)).astype(np.int32)
+    out = np.zeros_like(space)
+    out[box] = watershed(edge, markers, mask=space[box]) == 1
+    return out
+
+
+def _local_limit(work: Volume, space: Array, air: Array, limit: float, contrast: float) -> Array:
+    """Level between air and lung that follows the shading: half-way between both means, each within about 25 mm."""
     spacing = work.grid.spacing
-    reach = dilate(sure, 5.0, spacing)
-    lung = space & ~reach & (work.hu < limit + 0.8 * contrast)
+    lung = space & ~dilate(air, 3.0, spacing) & (work.hu < limit + 0.8 * contrast)
+    core = erode(air, 2.0, spacing)
     sums = []
-    for part, far in ((sure, limit - contrast / 2), (lung, limit + contrast / 2)):
+    for part, far in ((core, limit - contrast / 2), (lung, limit + contrast / 2)):
         weight = ndimage.gaussian_filter(part.astype(np.float32), SHADING_MM / spacing) + 0.01
         total = (
             ndimage.gaussian_filter(np.where(part, work.hu, 0).astype(np.float32), SHADING_MM / spacing) + 0.01 * far
         )
         sums.append(total / weight)
-    return (sums[0] + sums[1]) / 2, reach
+    return (sums[0] + sums[1]) / 2
 
 
 def _upsampled(values: Array, source: Grid, target: Grid) -> Array:

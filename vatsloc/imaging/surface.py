@@ -20,6 +20,7 @@ SEARCH_MM = 3.0
 RIM_MM = 3.0
 ACROSS_FISSURE_MM = 22.0
 CONFIDENCE = {"air": 1.0, "fissure": 1.0, "contact": 0.3, "dense": 0.1}
+HIDDEN_AIR_CONFIDENCE = 0.05
 
 
 class Border(IntEnum):
@@ -68,6 +69,7 @@ def deflated_surface(found: Pneumothorax, field: FieldOfView, spacing_mm: float 
     shift, crossed = _half_way(found.image, points, normals, inner, gas)
     confidence = np.array([CONFIDENCE[b.name.lower()] for b in Border])[border]
     confidence = np.where(crossed, confidence, 0.5 * confidence)
+    confidence[(border == Border.CONTACT) & _over_hidden_air(found, points, normals)] = HIDDEN_AIR_CONFIDENCE
     return SurfacePoints(points + shift[:, None] * normals, normals, confidence, border)
 
 
@@ -134,6 +136,13 @@ def _along(image: Volume, points: Array, normals: Array, offsets: tuple[float, .
 def _membership(mask: Mask, points: Array) -> Array:
     ijk = mask.grid.to_ijk(points)
     return ndimage.map_coordinates(mask.inside.astype(np.float32), ijk.T, order=1, mode="constant")
+
+
+def _over_hidden_air(found: Pneumothorax, points: Array, normals: Array) -> Array:
+    """Whether the last 6 mm of "lung" are so much darker than what lies deeper that a blurred film of air is likelier."""
+    skin = np.median(_along(found.image, points, normals, (-2.0, -3.0, -4.5, -6.0)), axis=1)
+    deep = np.median(_along(found.image, points, normals, (-11.0, -13.0, -15.0, -17.0)), axis=1)
+    return (skin < deep - 0.25 * found.contrast_hu) & (skin < found.limit_hu + 0.5 * found.contrast_hu)
 
 
 def _faces_lung(found: Pneumothorax, points: Array, normals: Array) -> Array:
