@@ -99,7 +99,7 @@ def make_shapes(build: Build, spacing: float = 3.0) -> Shapes:
         lungs.append(as_distance(lattice, soft_max(phi, np.broadcast_to(1.5 - sign * x, phi.shape), 3)))
     return Shapes(
         build=build,
-        body=as_distance(lattice, _body(build, x, y, z)),
+        body=near_distance(lattice, _body(build, x, y, z)),
         cage=near_distance(lattice, cage),
         right_lung=lungs[0],
         left_lung=lungs[1],

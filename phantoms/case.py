@@ -2,61 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
-from scipy.spatial.transform import Rotation
 
-from phantoms.cage import CageMotion, fit_dome
-from phantoms.cbct import Scanner, expose, scanner_grid
-from phantoms.fields import Lattice, coverage, smooth_noise
+from phantoms.cbct import expose, scanner_grid
+from phantoms.fields import Lattice, coverage
 from phantoms.imaging import Picture, State, image_state, nodule_mask
+from phantoms.spec import SPECS, PhantomSpec
+from phantoms.states import make_states, scanned_centre
 from phantoms.thorax import NODULE_HU, Thorax, ct_grid, draw_lung_trees, draw_thorax, image_body
-from phantoms.tissue import Equilibrium, Hilum, Pleura, Tissue, pleura_points, relax, tissue_points
+from phantoms.tissue import Equilibrium
 from registration.volume import Grid, Mask, Volume
 
 Array = NDArray[Any]
-
-
-@dataclass(frozen=True)
-class PhantomSpec:
-    """What to make. side: operated; ct_spacing, cbct_spacing: mm; inflated, deflated: lung volume over that in the CT;
-    dome_rise: mm the diaphragm rises further when the lung collapses; element: mm between nodes of the
-    lung's map; patchiness: factor on how uneven the tissue is; nodule_depth, nodule_radius: mm."""
-
-    name: str
-    side: str
-    ct_spacing: tuple[float, float, float] = (1.2, 1.2, 1.5)
-    cbct_spacing: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    cbct_length: float = 170.0
-    inflated: float = 0.87
-    deflated: float = 0.52
-    dome_rise: float = 8.0
-    element: float = 15.0
-    patchiness: float = 1.0
-    nodule_depth: float = 15.0
-    nodule_radius: float = 8.0
-    scanner: Scanner = field(default_factory=Scanner)
-
-
-_SMALL = PhantomSpec("small", "right", (1.5, 1.5, 2.0), (1.5, 1.5, 1.5), element=18.0)
-SPECS = {
-    s.name: s
-    for s in (
-        replace(_SMALL, name="demo", inflated=0.89, deflated=0.55, patchiness=0.6),
-        replace(_SMALL, name="small-right"),
-        replace(_SMALL, name="small-left", side="left"),
-        PhantomSpec("right", "right"),
-        PhantomSpec("left", "left", inflated=0.83, nodule_depth=25.0),
-        PhantomSpec("small-collapse", "right", deflated=0.64, dome_rise=0.0),
-        PhantomSpec("near-total-collapse", "left", deflated=0.42, dome_rise=12.0),
-        PhantomSpec("high-diaphragm", "right", dome_rise=20.0, nodule_depth=10.0),
-        PhantomSpec("poor-dose", "left", scanner=Scanner(noise=60.0, blur=0.9), nodule_radius=6.0),
-    )
-}
 
 
 @dataclass(frozen=True)
@@ -64,7 +26,7 @@ class PhantomCase:
     """A case and its truth. Images in HU; points in RAS mm of their own image's frame.
 
     gravity_cbct: (3,) unit vector in the frame of the CBCTs; landmarks: (n, 3); dense_truth: (n, 9) in the CT, inflated
-    and deflated; inflated, deflated: the states, which give the map at any point.
+    and deflated; thorax: the person; inflated, deflated: the states, which give the map at any point.
     """
 
     spec: PhantomSpec
@@ -82,6 +44,7 @@ class PhantomCase:
     landmarks_deflated: Array
     dense_truth: Array
     gravity_cbct: Array
+    thorax: Thorax
     inflated: State
     deflated: State
     masks: dict[str, Mask]
@@ -100,9 +63,9 @@ def make_case(spec: PhantomSpec | str, seed: int = 0) -> PhantomCase:
     thorax = draw_thorax(spec.side, spec.nodule_depth, spec.nodule_radius, seed)
     lung = thorax.shapes.lung(spec.side)
     lung = lung.crop(lung.values < 0, 24.0)
-    states, gravity, ends = _states(thorax, lung, spec, rng)
+    states, gravity, ends = make_states(thorax, lung, spec, rng)
     ct, body, ct_lung = _ct(thorax, lung, spec, rng)
-    grid = scanner_grid(_centre(thorax), spec.cbct_spacing, spec.cbct_length, spec.scanner.fov)
+    grid = scanner_grid(scanned_centre(thorax), spec.cbct_spacing, spec.cbct_length, spec.scanner.fov)
     grids = [_moved_grid(grid, s) for s in states]
     pictures = [image_state(thorax, body, s, g) for s, g in zip(states, grids, strict=True)]
     shots = [expose(p.clean, spec.scanner, rng) for p in pictures]
@@ -130,79 +93,12 @@ def make_case(spec: PhantomSpec | str, seed: int = 0) -> PhantomCase:
         landmarks_deflated=marks[1],
         dense_truth=dense,
         gravity_cbct=states[1].pose[:3, :3] @ gravity,
+        thorax=thorax,
         inflated=states[0],
         deflated=states[1],
         masks=_masks(ct_lung, pictures),
-        info=_info(states, ct_marks, dense_ct, ends, nodule_points),
+        info=_info(states, ct_marks, dense_ct, ends),
     )
-
-
-def _states(
-    thorax: Thorax, lung: Lattice, spec: PhantomSpec, rng: np.random.Generator
-) -> tuple[tuple[State, State], Array, list[Equilibrium]]:
-    sign = 1 if spec.side == "right" else -1
-    inflated_motion = fit_dome(CageMotion(thorax.build, sign, 0.0, 16.0, 5.0, 6.0), lung, spec.inflated)
-    deflated_motion = replace(
-        inflated_motion, operated_dome=inflated_motion.operated_dome + spec.dome_rise, shift=11.0, squeeze=4.0
-    )
-    gravity = np.array([-sign, 0.15, 0.05]) + rng.normal(0, 0.03, 3)
-    gravity /= np.linalg.norm(gravity)
-    points, volume = tissue_points(lung, spec.element / 2)
-    surface, area = pleura_points(lung, 2)
-    hilum = thorax.hila[thorax.index(spec.side)]
-    tied = points[np.linalg.norm(points - hilum, axis=1) < 20]
-    shear, slack = _uneven(thorax, lung, points, spec.patchiness, rng)
-    rest = np.cbrt(np.clip(spec.deflated * slack, 0.15, 0.95))
-    poses = _poses(_centre(thorax), rng)
-    states, ends = [], []
-    for motion, held, pose in ((inflated_motion, True, poses[0]), (deflated_motion, False, poses[1])):
-        cavity = motion.carry(lung)
-        end = relax(
-            Tissue(points, volume, shear, rest, 165.0),
-            Pleura(surface, area, cavity, held),
-            Hilum(tied, motion(tied), 300.0),
-            gravity,
-            motion,
-            None if held else spec.deflated,
-            spec.element,
-        )
-        ends.append(end)
-        states.append(State(lung, cavity, motion, end.state_from_ct, held, pose, points))
-    return (states[0], states[1]), gravity, ends
-
-
-def _uneven(
-    thorax: Thorax, lung: Lattice, points: Array, patchiness: float, rng: np.random.Generator
-) -> tuple[Array, Array]:
-    """Shear modulus (kPa) and factor on the rest volume at points: patchy tissue, a stiff root, a stiff nodule."""
-    hilum = thorax.hila[thorax.index(thorax.side)]
-    shear = 0.65 * np.exp(0.45 * patchiness * lung.like(smooth_noise(lung, 32.0, rng)).at(points))
-    slack = np.exp(0.22 * patchiness * lung.like(smooth_noise(lung, 38.0, rng)).at(points))
-    shear *= 1 + 5 * np.exp(-((np.linalg.norm(points - hilum, axis=1) / 24) ** 2))
-    lesion = coverage(thorax.nodule.distance(points), 8.0)
-    return shear * (1 + 10 * lesion), slack + lesion * (1.6 - slack)
-
-
-def _poses(centre: Array, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Frames of the two cone-beam images from the CT's: a turn and a shift, a little more of both for the second."""
-    first = _about(centre, rng, rng.uniform(8, 18), rng.uniform(30, 50))
-    second = _about(centre, rng, rng.uniform(1, 4), rng.uniform(5, 15)) @ first
-    return first, second
-
-
-def _about(centre: Array, rng: np.random.Generator, degrees: float, shift_mm: float) -> Array:
-    axis, way = rng.standard_normal((2, 3))
-    turn = Rotation.from_rotvec(np.deg2rad(degrees) * axis / np.linalg.norm(axis)).as_matrix()
-    pose = np.eye(4)
-    pose[:3, :3] = turn
-    pose[:3, 3] = centre + shift_mm * way / np.linalg.norm(way) - turn @ centre
-    return pose
-
-
-def _centre(thorax: Thorax) -> Array:
-    """Middle of the scanner's field of view in the frame of the CT."""
-    sign = 1 if thorax.side == "right" else -1
-    return np.array([sign * 50.0, -8.0, -42.0])
 
 
 def _moved_grid(grid: Grid, state: State) -> Grid:
@@ -280,9 +176,7 @@ def _masks(ct_lung: Mask, pictures: list[Picture]) -> dict[str, Mask]:
     }
 
 
-def _info(
-    states: tuple[State, State], marks: Array, dense: Array, ends: list[Equilibrium], nodules: list[Array]
-) -> dict[str, Any]:
+def _info(states: tuple[State, State], marks: Array, dense: Array, ends: list[Equilibrium]) -> dict[str, Any]:
     inflated, deflated = (s.lung_map for s in states)
     pose = np.linalg.norm(inflated(marks) - marks, axis=1)
     collapse = np.linalg.norm(deflated(marks) - inflated(marks), axis=1)

@@ -68,12 +68,9 @@ class Lattice:
 
     def crop(self, inside: Array, margin_mm: float) -> Lattice:
         """The part of the field around the nodes where `inside` is true, wider by `margin_mm`."""
-        found = [np.flatnonzero(inside.any(axis=tuple(m for m in range(3) if m != axis))) for axis in range(3)]
-        pad = int(np.ceil(margin_mm / self.spacing))
-        lo = [max(int(f[0]) - pad, 0) for f in found]
-        hi = [int(f[-1]) + pad + 1 for f in found]
-        values = self.values[lo[0] : hi[0], lo[1] : hi[1], lo[2] : hi[2]]
-        return Lattice(self.origin + self.spacing * np.array(lo), self.spacing, np.ascontiguousarray(values))
+        box = _box(inside, int(np.ceil(margin_mm / self.spacing)))
+        start = np.array([b.start for b in box])
+        return Lattice(self.origin + self.spacing * start, self.spacing, np.ascontiguousarray(self.values[box]))
 
     def on(self, grid: Grid) -> Array:
         """Trilinear values on an image whose axes are parallel to RAS, float32."""
@@ -126,18 +123,30 @@ def coverage(distance: Array, width_mm: float) -> Array:
 def near_distance(lattice: Lattice, implicit: Array) -> Lattice:
     """Signed distance (mm) to the zero level of an implicit function, negative inside; true near the level only."""
     gx, gy, gz = np.gradient(implicit.astype(np.float32), lattice.spacing)
-    return lattice.like(implicit / np.sqrt(np.maximum(gx * gx + gy * gy + gz * gz, 0.04)))
+    return lattice.like(implicit / np.sqrt(np.maximum(gx * gx + gy * gy + gz * gz, 0.0025)))
 
 
 def as_distance(lattice: Lattice, implicit: Array) -> Lattice:
-    """Signed distance (mm) to the zero level of an implicit function, negative inside; good everywhere."""
+    """Signed distance (mm) to the zero level of an implicit function, negative inside; good everywhere.
+
+    Further than ten nodes from the box around the region it is held at that distance.
+    """
     h = lattice.spacing
     near = near_distance(lattice, implicit).values
-    inside = near < 0
+    out = np.full(near.shape, 10 * h, dtype=np.float32)
+    box = _box(near < 0, 10)
+    inside = near[box] < 0
     far = ndimage.distance_transform_edt(~inside, sampling=h) - ndimage.distance_transform_edt(inside, sampling=h)
     far -= np.sign(far) * h / 2
     trust = np.clip((np.abs(far) - h) / h, 0, 1)
-    return lattice.like(np.clip(near, -3 * h, 3 * h) * (1 - trust) + far * trust)
+    out[box] = np.clip(near[box], -3 * h, 3 * h) * (1 - trust) + far * trust
+    return lattice.like(out)
+
+
+def _box(chosen: Array, pad: int) -> tuple[slice, slice, slice]:
+    found = [np.flatnonzero(chosen.any(axis=tuple(m for m in range(3) if m != axis))) for axis in range(3)]
+    x, y, z = (slice(max(int(f[0]) - pad, 0), int(f[-1]) + pad + 1) for f in found)
+    return x, y, z
 
 
 def _separable(values: Array, positions: list[Array]) -> Array:

@@ -145,7 +145,7 @@ class _Problem:
         self.on_pleura = basis(pleura.points, origin, spacing, shape)[0][:, self.active]
         self.on_hilum = basis(hilum.points, origin, spacing, shape)[0][:, self.active]
         self.lame = 1.5 * tissue.shear
-        self.contact = 1.5 * pleura.area
+        self.contact = (4.0 if pleura.held else 1.5) * pleura.area
         weight = tissue.density * 9.81e-6 * tissue.volume
         self.load = (self.value.T @ weight)[:, None] * gravity
         stiff = tissue.volume * tissue.shear * tissue.rest

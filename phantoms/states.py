@@ -1,0 +1,91 @@
+"""Inflated and collapsed lung of a thorax on the table: cage, tissue, equilibrium and pose of each state."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from phantoms.cage import CageMotion, fit_dome
+from phantoms.fields import Lattice, coverage, smooth_noise
+from phantoms.imaging import State
+from phantoms.spec import PhantomSpec
+from phantoms.thorax import Thorax
+from phantoms.tissue import Equilibrium, Hilum, Pleura, Tissue, pleura_points, relax, tissue_points
+
+Array = NDArray[Any]
+
+
+def make_states(
+    thorax: Thorax, lung: Lattice, spec: PhantomSpec, rng: np.random.Generator
+) -> tuple[tuple[State, State], Array, list[Equilibrium]]:
+    """Inflated and deflated state of the operated lung, gravity (3,) in the CT's frame, and both equilibria.
+
+    lung: signed distance (mm) of that lung in the CT. Gravity acts from the operated side to the other.
+    """
+    sign = 1 if spec.side == "right" else -1
+    inflated_motion = fit_dome(CageMotion(thorax.build, sign, 0.0, 16.0, 5.0, 6.0), lung, spec.inflated)
+    deflated_motion = replace(
+        inflated_motion, operated_dome=inflated_motion.operated_dome + spec.dome_rise, shift=11.0, squeeze=4.0
+    )
+    gravity = np.array([-sign, 0.15, 0.05]) + rng.normal(0, 0.03, 3)
+    gravity /= np.linalg.norm(gravity)
+    points, volume = tissue_points(lung, spec.element / 2)
+    surface, area = pleura_points(lung, 2)
+    hilum = thorax.hila[thorax.index(spec.side)]
+    tied = points[np.linalg.norm(points - hilum, axis=1) < 20]
+    shear, slack = _uneven(thorax, lung, points, spec.patchiness, rng)
+    rest = np.cbrt(np.clip(spec.deflated * slack, 0.15, 0.95))
+    poses = _poses(scanned_centre(thorax), rng)
+    states, ends = [], []
+    for motion, held, pose in ((inflated_motion, True, poses[0]), (deflated_motion, False, poses[1])):
+        cavity = motion.carry(lung)
+        end = relax(
+            Tissue(points, volume, shear, rest, 165.0),
+            Pleura(surface, area, cavity, held),
+            Hilum(tied, motion(tied), 300.0),
+            gravity,
+            motion,
+            None if held else spec.deflated,
+            spec.element,
+        )
+        ends.append(end)
+        states.append(State(lung, cavity, motion, end.state_from_ct, held, pose, points))
+    return (states[0], states[1]), gravity, ends
+
+
+def _uneven(
+    thorax: Thorax, lung: Lattice, points: Array, patchiness: float, rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """Shear modulus (kPa) and factor on the rest volume at points: patchy tissue, a stiff root, a stiff nodule."""
+    hilum = thorax.hila[thorax.index(thorax.side)]
+    shear = 0.65 * np.exp(0.45 * patchiness * lung.like(smooth_noise(lung, 32.0, rng)).at(points))
+    slack = np.exp(0.22 * patchiness * lung.like(smooth_noise(lung, 38.0, rng)).at(points))
+    shear *= 1 + 5 * np.exp(-((np.linalg.norm(points - hilum, axis=1) / 24) ** 2))
+    lesion = coverage(thorax.nodule.distance(points), 8.0)
+    return shear * (1 + 10 * lesion), slack + lesion * (1.6 - slack)
+
+
+def _poses(centre: Array, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Frames of the two cone-beam images from the CT's: a turn and a shift, a little more of both for the second."""
+    first = _about(centre, rng, rng.uniform(8, 18), rng.uniform(30, 50))
+    second = _about(centre, rng, rng.uniform(1, 4), rng.uniform(5, 15)) @ first
+    return first, second
+
+
+def _about(centre: Array, rng: np.random.Generator, degrees: float, shift_mm: float) -> Array:
+    axis, way = rng.standard_normal((2, 3))
+    turn = Rotation.from_rotvec(np.deg2rad(degrees) * axis / np.linalg.norm(axis)).as_matrix()
+    pose = np.eye(4)
+    pose[:3, :3] = turn
+    pose[:3, 3] = centre + shift_mm * way / np.linalg.norm(way) - turn @ centre
+    return pose
+
+
+def scanned_centre(thorax: Thorax) -> Array:
+    """Middle of the scanner's field of view in the frame of the CT."""
+    sign = 1 if thorax.side == "right" else -1
+    return np.array([sign * 50.0, -8.0, -42.0])

@@ -1,0 +1,187 @@
+"""Truth of a whole case: the map, the mass, the wall, and that the images show what the points say."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy import ndimage
+
+from phantoms import SPECS, PhantomCase, PhantomSpec, make_case
+from phantoms.cbct import scanner_grid
+from phantoms.imaging import State, image_state
+from phantoms.trees import Tree
+from registration.volume import Volume, axis_codes
+
+COARSE = PhantomSpec("coarse", "right", (4.0, 4.0, 4.0), (4.0, 4.0, 4.0), element=24.0)
+
+
+def _states(case: PhantomCase) -> list[tuple[str, State, Volume]]:
+    return [
+        ("inflated", case.inflated, case.cbct_inflated),
+        ("deflated", case.deflated, case.cbct_deflated),
+    ]
+
+
+def test_map_and_inverse_agree_at_two_thousand_points(demo: PhantomCase) -> None:
+    for n, (_, state, _) in enumerate(_states(demo)):
+        moved = demo.dense_truth[:, 3 * n + 3 : 3 * n + 6]
+        back, left = state.to_ct(moved)
+        assert_allclose(back, demo.dense_truth[:, :3], atol=0.01)
+        assert left.max() < 0.01
+
+
+def test_no_tissue_is_folded(demo: PhantomCase) -> None:
+    lung = demo.inflated.lung
+    points = lung.points()[lung.values.ravel() < 0]
+    for _, state, _ in _states(demo):
+        assert state.lung_map.determinant(points).min() > 0.1
+
+
+def test_volumes_are_those_asked_for(demo: PhantomCase) -> None:
+    inflated, deflated = demo.info["volume_ratio"]
+    # The held pleura hangs a tenth of a millimetre off the wall, which costs the inflated lung some volume.
+    assert inflated == pytest.approx(demo.spec.inflated, abs=0.03)
+    assert deflated == pytest.approx(demo.spec.deflated, abs=0.015)
+
+
+def test_mass_of_the_lung_is_kept(demo: PhantomCase) -> None:
+    nothing = Tree(np.zeros((1, 3)), np.array([-1]), np.zeros(1), np.zeros(1, dtype=int))
+    bare = replace(demo.thorax.trees[0], airway=nothing, artery=nothing, vein=nothing)
+    far = replace(demo.thorax.nodule, centre=np.array([1e4, 0.0, 0.0]))
+    thorax = replace(demo.thorax, trees=(bare, bare), nodule=far)
+    lung = demo.inflated.lung
+    inside = lung.values.ravel() < 0
+    before = (thorax.parenchyma.at(lung.points()[inside]) + 1000).sum() * lung.spacing**3
+    for _, state, _ in _states(demo):
+        middle = state.posed(state.lung_map(state.samples)).mean(axis=0)
+        grid = scanner_grid(middle, (2.5, 2.5, 2.5), 340.0, 260.0)
+        body = Volume(np.full((4, 4, 4), -1000, dtype=np.float32), np.diag([1.0, 1, 1, 1]))
+        hu = image_state(thorax, body, state, grid).clean.hu
+        after = (hu[hu > -990] + 1000).sum() * 2.5**3
+        assert after == pytest.approx(before, rel=0.01)
+
+
+def test_lung_slides_along_the_wall_and_stays_on_it(demo: PhantomCase) -> None:
+    lung, state = demo.inflated.lung, demo.inflated
+    points = lung.points()
+    skin = points[(np.abs(lung.values.ravel()) < 1.0) & (points[:, 0] > 85) & (points[:, 2] > -60)]
+    _, normal = lung.with_gradient(skin)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    jump = state.lung_map(skin) - state.motion(skin)
+    along = np.linalg.norm(jump - (jump * normal).sum(axis=1, keepdims=True) * normal, axis=1)
+    assert along.mean() > 2.5
+    assert np.abs(state.cavity.at(state.lung_map(skin)) - lung.at(skin)).mean() < 0.6
+
+
+def test_collapsed_lung_sinks_inside_its_room(demo: PhantomCase) -> None:
+    lung = demo.deflated.lung
+    skin = lung.points()[np.abs(lung.values.ravel()) < 1.0]
+    depth = demo.deflated.cavity.at(demo.deflated.lung_map(skin))
+    assert np.percentile(depth, 99.5) < 2.0
+    # More than a quarter of the pleura faces gas.
+    assert (depth < -4).mean() > 0.25
+
+
+def test_initial_errors_are_those_of_the_clinic(demo: PhantomCase) -> None:
+    assert 7 < demo.info["pose_mm"][0] < 15
+    assert 12 < demo.info["pneumothorax_mm"][0] < 25
+    assert 30 <= len(demo.landmarks_ct) <= 60
+
+
+def test_best_affine_map_leaves_as_much_as_in_real_lungs(demo: PhantomCase) -> None:
+    source, moved = demo.dense_truth[:, 3:6], demo.dense_truth[:, 6:]
+    back = demo.deflated.unposed(moved), demo.inflated.unposed(source)
+    motion = np.linalg.norm(back[0] - back[1], axis=1).mean()
+    rows = np.c_[back[1], np.ones(len(source))]
+    fit = rows @ np.linalg.lstsq(rows, back[0], rcond=None)[0]
+    assert 0.12 < np.linalg.norm(fit - back[0], axis=1).mean() / motion < 0.4
+
+
+@pytest.mark.parametrize("name", ["inflated", "deflated"])
+def test_nodule_is_seen_where_the_truth_says(demo: PhantomCase, name: str) -> None:
+    image, truth = (
+        (demo.cbct_inflated, demo.nodule_inflated) if name == "inflated" else (demo.cbct_deflated, demo.nodule_deflated)
+    )
+    mask = demo.masks[f"nodule_{name}"]
+    assert_allclose(mask.grid.to_ras(np.argwhere(mask.inside).mean(axis=0)), truth, atol=0.3)
+    near = np.argwhere(np.linalg.norm(image.grid.points() - truth, axis=-1) < 1.15 * demo.spec.nodule_radius)
+    bright = near[image.hu[tuple(near.T)] > -350]
+    assert_allclose(image.grid.to_ras(bright.mean(axis=0)), truth, atol=1.0)
+
+
+def test_landmarks_lie_on_structures_in_every_image(demo: PhantomCase) -> None:
+    for image, marks in (
+        (demo.ct, demo.landmarks_ct),
+        (demo.cbct_inflated, demo.landmarks_inflated),
+        (demo.cbct_deflated, demo.landmarks_deflated),
+    ):
+        smooth = ndimage.gaussian_filter(image.hu, 1.0 / image.grid.spacing)
+        wide = ndimage.gaussian_filter(image.hu, 6.0 / image.grid.spacing)
+        contrast = np.abs(ndimage.map_coordinates(smooth - wide, image.grid.to_ijk(marks).T, order=1))
+        shifted = marks + np.array([7.0, -6.0, 6.0])
+        beside = np.abs(ndimage.map_coordinates(smooth - wide, image.grid.to_ijk(shifted).T, order=1))
+        assert np.median(contrast) > 2 * np.median(beside)
+
+
+def test_tissues_have_their_densities(demo: PhantomCase) -> None:
+    ct = demo.ct
+    lung = ndimage.binary_erosion(demo.masks["lung_ct"].inside, iterations=3)
+    assert -870 < np.median(ct.hu[lung]) < -800
+    assert 30 < np.median(ct.hu[(ct.hu > 0) & (ct.hu < 150)]) < 60
+    assert np.percentile(ct.hu, 99.5) > 300
+    deflated = ndimage.binary_erosion(demo.masks["lung_deflated"].inside, iterations=3)
+    room = demo.deflated.cavity.at(demo.deflated.unposed(demo.cbct_deflated.grid.points().reshape(-1, 3)))
+    gas = (room.reshape(deflated.shape) < -4) & ~ndimage.binary_dilation(
+        demo.masks["lung_deflated"].inside, iterations=4
+    )
+    inside = np.ones_like(gas)
+    i, j = (np.indices(gas.shape[:2]) - (gas.shape[0] - 1) / 2) * demo.cbct_deflated.grid.spacing[0]
+    inside[np.hypot(i, j) > 110] = False
+    assert np.median(demo.cbct_deflated.hu[gas & inside]) < -960
+    assert np.percentile(demo.cbct_deflated.hu[deflated], 5) > -860
+
+
+def test_headers_agree_within_what_a_case_may_ask(demo: PhantomCase) -> None:
+    for _, state, image in _states(demo):
+        turn = np.degrees(np.arccos((np.trace(state.pose[:3, :3]) - 1) / 2))
+        assert 4 < turn < 25
+        centre = image.grid.to_ras((np.array(image.grid.shape) - 1) / 2)
+        assert np.linalg.norm(state.unposed(centre[None])[0] - centre) < 100
+        assert axis_codes(image.ras_from_ijk) == "LPS"
+        assert_allclose(state.unposed(state.posed(demo.landmarks_ct)), demo.landmarks_ct, atol=1e-9)
+
+
+def test_operated_lung_is_in_view(demo: PhantomCase) -> None:
+    for _, state, image in _states(demo):
+        ijk = image.grid.to_ijk(state.from_ct(state.samples))
+        off = (ijk - (np.array(image.grid.shape) - 1) / 2) * image.grid.spacing
+        half = image.grid.shape[2] * image.grid.spacing[2] / 2
+        assert ((np.hypot(off[:, 0], off[:, 1]) < 120) & (np.abs(off[:, 2]) < half)).mean() > 0.4
+
+
+def test_equal_seeds_give_equal_cases_and_others_do_not(demo: PhantomCase) -> None:
+    one, same = (make_case(COARSE, 3) for _ in range(2))
+    assert np.array_equal(one.ct.hu, same.ct.hu)
+    assert np.array_equal(one.cbct_deflated.hu, same.cbct_deflated.hu)
+    assert np.array_equal(one.dense_truth, same.dense_truth)
+    assert not np.allclose(one.nodule_ct, demo.nodule_ct, atol=1)
+
+
+def test_left_case_collapses_on_the_left() -> None:
+    case = make_case(replace(COARSE, side="left"), 5)
+    assert case.side == "left"
+    assert case.nodule_ct[0] < 0
+    assert case.gravity_cbct[0] > 0.8
+    assert case.dense_truth[:, 0].max() < 10
+    gas = case.deflated.cavity.at(case.deflated.lung_map(case.deflated.samples))
+    assert gas.min() < -20
+
+
+def test_unknown_names_and_sides_are_refused() -> None:
+    with pytest.raises(ValueError, match="no phantom is called 'nobody', choose one of demo"):
+        make_case("nobody")
+    with pytest.raises(ValueError, match="side must be 'right' or 'left'"):
+        make_case(replace(SPECS["demo"], side="up"))
