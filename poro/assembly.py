@@ -1,0 +1,69 @@
+"""Finite-element matrices of linear tetrahedra, assembled in batches.
+
+Unknowns of displacement are numbered 3 * node + axis. Ref: Alvarez 2021, eqs. 2, 10, 11.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.sparse import coo_matrix, csr_matrix
+
+from poro.mesh.tetmesh import Array, TetMesh
+
+
+def _scatter(mesh: TetMesh, local: Array, rows: int, columns: int) -> csr_matrix:
+    """Sum element blocks (m, 4 * rows, 4 * columns) into a sparse matrix (n * rows, n * columns)."""
+    m, n = len(mesh.tets), len(mesh.points)
+    i = (mesh.tets[:, :, None] * rows + np.arange(rows)).reshape(m, -1, 1)
+    j = (mesh.tets[:, :, None] * columns + np.arange(columns)).reshape(m, 1, -1)
+    i, j = np.broadcast_arrays(i, j)
+    return coo_matrix((local.ravel(), (i.ravel(), j.ravel())), shape=(n * rows, n * columns)).tocsr()
+
+
+def stiffness(mesh: TetMesh, lame: float | Array, shear: float | Array) -> csr_matrix:
+    """Linear elasticity: integral of (lambda tr(eps) I + 2 mu eps) : eps(v), (3n, 3n) kPa mm; moduli scalar or (m,) kPa."""
+    g = mesh.gradients
+    volume = mesh.volumes
+    outer = np.einsum("mai,mbj->maibj", g, g)
+    dots = np.einsum("mai,mbi->mab", g, g)
+    swapped = outer.transpose(0, 1, 4, 3, 2)
+    local = (lame * volume)[:, None, None, None, None] * outer + (shear * volume)[:, None, None, None, None] * swapped
+    for axis in range(3):
+        local[:, :, axis, :, axis] += (shear * volume)[:, None, None] * dots
+    return _scatter(mesh, local.reshape(-1, 12, 12), 3, 3)
+
+
+def laplacian(mesh: TetMesh) -> csr_matrix:
+    """Integral of grad p . grad q, (n, n) mm."""
+    return _scatter(mesh, np.einsum("mai,mbi,m->mab", mesh.gradients, mesh.gradients, mesh.volumes), 1, 1)
+
+
+def consistent_mass(mesh: TetMesh) -> csr_matrix:
+    """Integral of p q, (n, n) mm3."""
+    local = (np.ones((4, 4)) + np.eye(4)) / 20 * mesh.volumes[:, None, None]
+    return _scatter(mesh, local, 1, 1)
+
+
+def gradient_load(mesh: TetMesh) -> csr_matrix:
+    """Integral of -grad p . v, (3n, n) mm2: nodal forces of a unit Biot coefficient per kPa of nodal pressure."""
+    local = -np.einsum("mbi,m->mib", mesh.gradients, mesh.volumes / 4)
+    local = np.repeat(local[:, None], 4, axis=1).reshape(-1, 12, 4)
+    return _scatter(mesh, local, 3, 1)
+
+
+def body_load(mesh: TetMesh, density: Array) -> Array:
+    """Nodal forces (n, 3) kPa mm2 of a uniform force density (3,) kPa/mm."""
+    return mesh.node_volumes[:, None] * density
+
+
+def eigenstress_load(mesh: TetMesh, stress: Array) -> Array:
+    """Nodal forces (n, 3) that an eigenstress (m, 3, 3) kPa exerts: integral of stress : grad v."""
+    local = np.einsum("mij,maj,m->mai", stress, mesh.gradients, mesh.volumes)
+    force = np.zeros((len(mesh.points), 3))
+    np.add.at(force, mesh.tets, local)
+    return force
+
+
+def deformation_gradient(mesh: TetMesh, u: Array) -> Array:
+    """F = I + grad u in every tetrahedron, (m, 3, 3), of nodal displacements (n, 3) mm."""
+    return np.eye(3) + np.einsum("mai,maj->mij", u[mesh.tets], mesh.gradients)

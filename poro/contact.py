@@ -1,0 +1,228 @@
+"""Frictionless Signorini contact with a rigid surface by a primal-dual active set on the compliance of contact nodes.
+
+Ref: Alvarez 2021, eqs. 12-14; Hueber & Wohlmuth 2005 (primal-dual active set); Murty 1974 (least-index pivoting).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+from functools import cached_property
+
+import numpy as np
+from scipy.linalg import inv, solve
+
+from poro.compliance import Compliance
+from poro.levelset import LevelSet
+from poro.mesh.tetmesh import Array
+
+GAP_TOLERANCE_MM = 1e-9
+SPRING_CUT = 1e-6
+MAX_MOVE_MM = 20.0  # largest step over which a linearized wall is believed
+
+
+class ContactStatus(Enum):
+    """How the contact problem ended."""
+
+    SETTLED = "the active set and the contact points no longer change"
+    PIVOTED = "the active set cycled and was settled by single pivots"
+    STOPPED = "the contact points still moved when the iterations ran out"
+
+
+@dataclass(frozen=True)
+class Obstacle:
+    """Rigid wall around the lung, a part of which moves along an axis.
+
+    level: distance to the wall, positive inside; rest: (nc, 3) mm contact nodes at rest; moving: (nc,) bool, nodes that
+    face the moving part; axis: (3,) unit vector; offset: (nc,) mm subtracted so that no node starts behind the wall.
+    """
+
+    level: LevelSet
+    rest: Array
+    moving: Array
+    axis: Array
+    offset: Array
+
+    def gap(self, u: Array, travel_mm: float) -> tuple[Array, Array, Array]:
+        """Gap (nc,) mm, its gradient (nc, 3) and Hessian (nc, 3, 3) at displacements u (nc, 3)."""
+        value, gradient, hessian = self.level.evaluate(self.rest + u - travel_mm * self.moving[:, None] * self.axis)
+        return value - self.offset, gradient, hessian
+
+
+@dataclass(frozen=True)
+class ContactState:
+    """Solution of the contact problem on nc nodes.
+
+    u: (nc, 3) mm; force: (nc,) kPa mm2 along the gap's gradient; gap, gradient, hessian: of the obstacle there;
+    active: (nc,) bool; steps: outer iterations; pivots: active-set iterations in all; moves: last changes in mm.
+    """
+
+    u: Array
+    force: Array
+    gap: Array
+    gradient: Array
+    hessian: Array
+    active: Array
+    steps: int
+    pivots: int
+    moves: tuple[float, ...]
+    status: ContactStatus
+
+
+def settle(
+    compliance: Compliance,
+    obstacle: Obstacle,
+    free: Array,
+    travel_mm: float,
+    start: ContactState | None = None,
+    tolerance_mm: float = 1e-3,
+    max_steps: int = 60,
+) -> ContactState:
+    """Contact forces that keep every node in front of the wall, for the displacements `free` (nc, 3) without any wall.
+
+    The gap is linearized where the nodes are and the linear complementarity problem solved, until no node moves by more
+    than `tolerance_mm`.
+    """
+    u = start.u if start else np.zeros_like(free)
+    active = start.active if start else np.zeros(len(free), bool)
+    force = start.force if start else np.zeros(len(free))
+    moves: list[float] = []
+    pivots, cycled = 0, False
+    while len(moves) < max_steps:
+        gap, gradient, hessian = obstacle.gap(u, travel_mm)
+        springs = curvature_springs(compliance, force, hessian)
+        wall = Linearized(compliance, gap, gradient, u, free, springs)
+        force, active, target, used, single = complementarity(wall, active)
+        pivots, cycled = pivots + used, cycled or single
+        moves.append(float(np.linalg.norm(target - u, axis=1).max(initial=0)))
+        u = u + min(1.0, MAX_MOVE_MM / max(moves[-1], 1e-30)) * (target - u)
+        if moves[-1] < tolerance_mm:
+            break
+    gap, gradient, hessian = obstacle.gap(u, travel_mm)
+    settled = ContactStatus.PIVOTED if cycled else ContactStatus.SETTLED
+    status = settled if moves[-1] < tolerance_mm else ContactStatus.STOPPED
+    return ContactState(u, force, gap, gradient, hessian, active, len(moves), pivots, tuple(moves), status)
+
+
+@dataclass(frozen=True)
+class Springs:
+    """Stiffness sum d v v' at single contact nodes, by which the wall's curvature turns the forces on sliding nodes.
+
+    rows, along: (r,) nodes and (r, 3) directions v; strength: (r,) d in kPa mm, of either sign;
+    inverse: (r, r) of diag(1/d) + V' C V.
+    """
+
+    rows: Array
+    along: Array
+    strength: Array
+    inverse: Array
+
+
+def curvature_springs(compliance: Compliance, force: Array, hessian: Array) -> Springs:
+    """Springs of forces (nc,) on a wall of Hessian (nc, 3, 3): a hollow wall steadies the nodes that press on it."""
+    nodes = np.flatnonzero(force)
+    values, vectors = np.linalg.eigh(-force[nodes, None, None] * hessian[nodes])
+    flat = values.ravel()
+    # Springs far softer than the tissue change nothing but the size of the dense system.
+    keep = np.abs(flat) > SPRING_CUT * np.abs(flat).max(initial=0)
+    rows, along, strength = np.repeat(nodes, 3)[keep], vectors.transpose(0, 2, 1).reshape(-1, 3)[keep], flat[keep]
+    matrix = compliance.between(rows, along, rows, along) + np.diag(1 / strength)
+    return Springs(rows, along, strength, inv(matrix) if len(rows) else matrix)
+
+
+@dataclass(frozen=True)
+class Linearized:
+    """Wall seen from displacements u (nc, 3): gap (nc,), gradient (nc, 3), curvature springs; free: (nc, 3) without wall."""
+
+    compliance: Compliance
+    gap: Array
+    gradient: Array
+    u: Array
+    free: Array
+    springs: Springs
+
+    @cached_property
+    def anchor(self) -> Array:
+        """Forces (r,) of the springs when no other contact force acts."""
+        pull = np.einsum("rd,rd->r", self.springs.along, (self.u - self.free)[self.springs.rows])
+        return self.springs.inverse @ pull
+
+    def reduced(self, pool: Array) -> tuple[Array, Array, Array]:
+        """Compliance (k, k) and gap (k,) of nodes `pool` with the springs eliminated, and how they load the springs (r, k)."""
+        n, s = self.gradient[pool], self.springs
+        coupling = self.compliance.between(s.rows, s.along, pool, n)
+        matrix = self.compliance.between(pool, n, pool, n) - coupling.T @ (s.inverse @ coupling)
+        offset = self.gap[pool] + np.einsum("nd,nd->n", n, (self.free - self.u)[pool]) + coupling.T @ self.anchor
+        return matrix, offset, coupling
+
+    def displacement(self, pool: Array, force: Array, coupling: Array) -> Array:
+        """Displacements (nc, 3) under normal forces (k,) at nodes `pool`, springs included."""
+        total = np.zeros_like(self.u)
+        total[pool] = self.gradient[pool] * force[:, None]
+        np.add.at(
+            total,
+            self.springs.rows,
+            self.springs.along * (self.anchor - self.springs.inverse @ (coupling @ force))[:, None],
+        )
+        return self.free + self.compliance.apply(total)
+
+
+def complementarity(
+    wall: Linearized, active: Array, max_pivots: int = 400
+) -> tuple[Array, Array, Array, int, bool]:
+    """Forces (nc,) >= 0 with linearized gap >= 0 and gap . force = 0, from a guessed active set (nc,) bool.
+
+    Returns forces, active set, displacements (nc, 3), pivots, and whether the set cycled, after which one node at a time
+    is exchanged. Raises RuntimeError when even that does not settle.
+    """
+    seen: set[bytes] = set()
+    single = False
+    pool = np.flatnonzero(active)
+    matrix, offset, coupling = wall.reduced(pool)
+    for pivot in range(1, max_pivots + 1):
+        rows = np.flatnonzero(active)
+        if not np.isin(rows, pool).all():
+            pool = np.union1d(pool, rows)
+            matrix, offset, coupling = wall.reduced(pool)
+        within = np.searchsorted(pool, rows)
+        push = np.zeros(len(pool))
+        if len(rows):
+            push[within] = -solve(matrix[np.ix_(within, within)], offset[within], assume_a="sym", check_finite=False)
+        u = wall.displacement(pool, push, coupling)
+        force = np.zeros(len(active))
+        force[pool] = push
+        gap = wall.gap + np.einsum("nd,nd->n", wall.gradient, u - wall.u)
+        wrong = (active & (force < 0)) | (~active & (gap < -GAP_TOLERANCE_MM))
+        if not wrong.any():
+            return force, active, u, pivot, single
+        key = np.packbits(active).tobytes()
+        single = single or key in seen
+        seen.add(key)
+        if single:
+            # Exchanging only the last violating node cannot cycle while the compliance is positive definite.
+            wrong = np.arange(len(wrong)) == np.flatnonzero(wrong)[-1]
+        active = active ^ wrong
+    raise RuntimeError(f"the active set did not settle in {max_pivots} pivots; check that the hilum holds the lung")
+
+
+def contact_sensitivity(
+    compliance: Compliance, obstacle: Obstacle, state: ContactState, free: Array, travel: Array
+) -> Array:
+    """Derivatives of the contact forces, (nc, 3, k), at a fixed active set.
+
+    free: (nc, 3, k) derivatives of the displacements without wall; travel: (k,) derivatives of the wall's travel. The wall's
+    curvature turns the forces as the nodes slide; normal and turning forces come from one symmetric system.
+    """
+    active = np.flatnonzero(state.active)
+    springs = curvature_springs(compliance, np.where(state.active, state.force, 0), state.hessian)
+    rows = np.concatenate([active, springs.rows])
+    direction = np.concatenate([state.gradient[active], springs.along])
+    result = np.zeros_like(free)
+    if len(rows) == 0:
+        return result
+    matrix = compliance.between(rows, direction, rows, direction)
+    matrix += np.diag(np.concatenate([np.zeros(len(active)), 1 / springs.strength]))
+    drift = -(obstacle.moving[:, None] * obstacle.axis)[:, :, None] * travel
+    weight = -solve(matrix, np.einsum("rd,rdk->rk", direction, (free + drift)[rows]), assume_a="sym")
+    np.add.at(result, rows, direction[:, :, None] * weight[:, None])
+    return result

@@ -1,0 +1,290 @@
+"""Fit of the poroelastic lung to the deflated anatomy, by bounded robust least squares. Ref: Alvarez 2021, sec. 7.3."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+
+from poro.mesh.locate import interpolate, locate
+from poro.mesh.tetmesh import Array
+from poro.model import (
+    DIAPHRAGM_BOUNDS_MM,
+    KAPPA_B_BOUNDS,
+    PHI_BOUNDS,
+    PoroState,
+    PoroStatus,
+    PoroSystem,
+    Theta,
+    sensitivity,
+    solve,
+)
+from poro.observations import Observer, Residuals, Target
+
+CHI2_95_3D = 7.814728  # 95 % quantile of chi-squared with three degrees of freedom
+
+
+@dataclass(frozen=True)
+class FitSettings:
+    """How a fit weighs its data and when it stops.
+
+    surface_sigma_mm, keypoint_sigma_mm: standard deviations of one observation; correlation_mm: surface points closer than this
+    count as one; robust: residual, in standard deviations, from which influence falls off (Cauchy), infinite for none;
+    plain: the paper's nearest-node cost; free: which entries of theta and the modes may move, all when None.
+    """
+
+    surface_sigma_mm: float = 2.0
+    keypoint_sigma_mm: float = 2.0
+    correlation_mm: float = 15.0
+    robust: float = 3.0
+    plain: bool = False
+    free: tuple[bool, ...] | None = None
+    max_steps: int = 30
+    tolerance: float = 1e-3
+    starts: tuple[tuple[float, float, float], ...] = ((1e-8, 0.8, 0.0),)
+
+
+class FitStatus(Enum):
+    """How a fit ended."""
+
+    CONVERGED = "the last step no longer lowered the cost by a thousandth"
+    STOPPED = "the steps ran out before the cost settled"
+    CONTACT = "the forward solution at the best parameters did not settle"
+
+
+@dataclass(frozen=True)
+class FitStep:
+    """One accepted or refused trial: cost, damping, theta as a vector."""
+
+    cost: float
+    damping: float
+    theta: Array
+    accepted: bool
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Best parameters and how well they are known.
+
+    covariance: (3 + k, 3 + k) of Theta.vector(); sensitivity: (n, 3, 3 + k); surface_rms_mm, keypoint_rms_mm: weighted
+    residuals; spread: (starts, 3 + k) where every start ended; costs: (starts,).
+    """
+
+    theta: Theta
+    state: PoroState
+    covariance: Array
+    sensitivity: Array
+    surface_rms_mm: float
+    keypoint_rms_mm: float
+    history: tuple[FitStep, ...]
+    spread: Array
+    costs: Array
+    status: FitStatus
+
+
+@dataclass(frozen=True)
+class _Problem:
+    system: PoroSystem
+    observer: Observer
+    settings: FitSettings
+    scale: Array
+
+    def whiten(self, rows: Residuals) -> Array:
+        """Factor (r,) that turns millimetres into standard deviations of independent observations."""
+        sigma = np.where(rows.surface, self.settings.surface_sigma_mm, self.settings.keypoint_sigma_mm)
+        return np.sqrt(rows.weight * self.scale[rows.group]) / sigma
+
+    def cost(self, rows: Residuals, whitening: Array, theta: Array) -> float:
+        """Half the robust sum of squares plus the modes' prior."""
+        return float(self._loss(rows, whitening).sum() + 0.5 * np.sum((theta[3:] / self._sigmas) ** 2))
+
+    def influence(self, rows: Residuals) -> Array:
+        """Weight (r,) of every row by the Cauchy loss of its observation."""
+        c = self.settings.robust
+        return 1 / (1 + self._squares(rows)[rows.group] / c**2)
+
+    def _squares(self, rows: Residuals) -> Array:
+        sigma = np.where(rows.surface, self.settings.surface_sigma_mm, self.settings.keypoint_sigma_mm)
+        return np.bincount(rows.group, (rows.value / sigma) ** 2, len(self.scale))
+
+    def _loss(self, rows: Residuals, whitening: Array) -> Array:
+        c, square = self.settings.robust, self._squares(rows)
+        sigma = np.where(rows.surface, self.settings.surface_sigma_mm, self.settings.keypoint_sigma_mm)
+        trust = np.zeros(len(self.scale))
+        trust[rows.group] = (whitening * sigma) ** 2
+        return 0.5 * trust * (c**2 * np.log1p(square / c**2) if np.isfinite(c) else square)
+
+    @property
+    def _sigmas(self) -> Array:
+        return np.array([mode.sigma for mode in self.system.modes])
+
+    def prior(self) -> Array:
+        """Diagonal (3 + k,) of the prior's inverse covariance."""
+        return np.concatenate([np.zeros(3), self._sigmas**-2.0])
+
+
+def bounds(system: PoroSystem) -> tuple[Array, Array]:
+    """Lower and upper bounds of Theta.vector()."""
+    wide = np.full(len(system.modes), np.inf)
+    low = [np.log10(KAPPA_B_BOUNDS[0]), PHI_BOUNDS[0], DIAPHRAGM_BOUNDS_MM[0]]
+    high = [np.log10(KAPPA_B_BOUNDS[1]), PHI_BOUNDS[1], DIAPHRAGM_BOUNDS_MM[1]]
+    return np.concatenate([low, -wide]), np.concatenate([high, wide])
+
+
+def fit(
+    system: PoroSystem,
+    target: Target,
+    settings: FitSettings | None = None,
+    progress: Callable[[str, float], None] | None = None,
+) -> Fit:
+    """Parameters whose deflated lung comes closest to the target; the best of the deterministic starts.
+
+    Raises ValueError when the target holds nothing of positive weight.
+    """
+    settings = settings or FitSettings()
+    if not target.weights.any() and not target.keypoint_weights.any():
+        raise ValueError("target holds no point of positive weight; give surface points or matched inner points")
+    observer = Observer(system.mesh, target, settings.plain)
+    problem = _Problem(system, observer, settings, _independence(target, settings.correlation_mm))
+    runs = []
+    for number, start in enumerate(settings.starts):
+        if progress:
+            progress("fit", number / len(settings.starts))
+        runs.append(_descend(problem, np.array([np.log10(start[0]), *start[1:], *np.zeros(len(system.modes))])))
+    theta, state, history, settled = min(runs, key=lambda run: run[2][-1].cost)
+    status = FitStatus.CONVERGED if settled else FitStatus.STOPPED
+    if state.status is PoroStatus.NOT_SETTLED:
+        status = FitStatus.CONTACT
+    du = sensitivity(system, state)
+    rows = observer.residuals(state.u)
+    covariance = _covariance(problem, rows, du, theta)
+    return Fit(
+        theta=Theta.of(theta),
+        state=state,
+        covariance=covariance,
+        sensitivity=du,
+        surface_rms_mm=_rms(rows, rows.surface),
+        keypoint_rms_mm=_rms(rows, ~rows.surface),
+        history=history,
+        spread=np.array([run[0] for run in runs]),
+        costs=np.array([run[2][-1].cost for run in runs]),
+        status=status,
+    )
+
+
+def ellipsoid95(result: Fit, system: PoroSystem, point: Array) -> tuple[Array, Array]:
+    """Half axes (3,) mm, longest first, and directions (3, 3) in columns, that hold an inflated point's image with 95 %.
+
+    The parameters' covariance carried to the point, plus what the fit leaves unexplained at the points it sees.
+    """
+    du = interpolate(locate(system.mesh, np.atleast_2d(point)), result.sensitivity)[0]
+    unexplained = max(result.surface_rms_mm, result.keypoint_rms_mm / np.sqrt(3))
+    spread = du @ result.covariance @ du.T + unexplained**2 * np.eye(3)
+    values, vectors = np.linalg.eigh(spread)
+    return np.sqrt(CHI2_95_3D * values[::-1]), vectors[:, ::-1]
+
+
+def _descend(problem: _Problem, theta: Array) -> tuple[Array, PoroState, tuple[FitStep, ...], bool]:
+    """Levenberg-Marquardt with projection onto the bounds; weights are frozen at every accepted state."""
+    low, high = bounds(problem.system)
+    free = np.ones(len(theta), bool) if problem.settings.free is None else np.array(problem.settings.free)
+    theta = np.clip(theta, low, high)
+    state = solve(problem.system, Theta.of(theta))
+    rows = problem.observer.residuals(state.u)
+    whitening = problem.whiten(rows)
+    cost = problem.cost(rows, whitening, theta)
+    damping = 1e-2
+    history = [FitStep(cost, damping, theta, True)]
+    normal, slope = _normal_equations(problem, rows, whitening, sensitivity(problem.system, state), theta)
+    for _ in range(problem.settings.max_steps):
+        step = _bounded_step(normal, slope, damping, theta, low, high, free)
+        if not step.any():
+            return theta, state, tuple(history), True
+        trial_state = solve(problem.system, Theta.of(theta + step), state)
+        trial_rows = problem.observer.residuals(trial_state.u)
+        trial_cost = problem.cost(trial_rows, problem.whiten(trial_rows), theta + step)
+        accepted = trial_cost < cost and trial_state.status is not PoroStatus.NOT_SETTLED
+        history.append(FitStep(trial_cost if accepted else cost, damping, theta + step, accepted))
+        if not accepted:
+            damping *= 10
+            if damping > 1e6:
+                return theta, state, tuple(history), True
+            continue
+        gain = (cost - trial_cost) / cost
+        theta, state, rows, cost = theta + step, trial_state, trial_rows, trial_cost
+        if gain < problem.settings.tolerance:
+            return theta, state, tuple(history), True
+        damping = max(damping / 10, 1e-6)
+        normal, slope = _normal_equations(
+            problem, rows, problem.whiten(rows), sensitivity(problem.system, state), theta
+        )
+    return theta, state, tuple(history), False
+
+
+def _normal_equations(
+    problem: _Problem, rows: Residuals, whitening: Array, du: Array, theta: Array
+) -> tuple[Array, Array]:
+    jacobian = rows.derivative(du)
+    weight = whitening**2 * problem.influence(rows)
+    prior = problem.prior()
+    normal = jacobian.T @ (weight[:, None] * jacobian) + np.diag(prior)
+    return normal, jacobian.T @ (weight * rows.value) + prior * theta
+
+
+def _bounded_step(
+    normal: Array, slope: Array, damping: float, theta: Array, low: Array, high: Array, free: Array
+) -> Array:
+    """Damped Gauss-Newton step; entries that would leave the box stop at its wall and the others are solved again."""
+    step = np.zeros_like(theta)
+    moving = free.copy()
+    damped = normal + damping * np.diag(np.maximum(np.diag(normal), 1e-12 * np.diag(normal).max()))
+    for _ in range(len(theta)):
+        inner = np.flatnonzero(moving)
+        if len(inner) == 0:
+            break
+        held = ~moving
+        right = -slope[inner] - damped[np.ix_(inner, np.flatnonzero(held))] @ step[held]
+        step[inner] = np.linalg.solve(damped[np.ix_(inner, inner)], right)
+        outside = moving & ((theta + step < low) | (theta + step > high))
+        if not outside.any():
+            break
+        step[outside] = np.clip(theta + step, low, high)[outside] - theta[outside]
+        moving &= ~outside
+    return step
+
+
+def _independence(target: Target, correlation_mm: float) -> Array:
+    """Share (t + k,) of an independent observation that every point is worth, by its neighbours within the correlation length."""
+    from scipy.spatial import cKDTree
+
+    points = target.points
+    crowd = np.ones(len(points))
+    if len(points) and correlation_mm > 0:
+        tree = cKDTree(points)
+        crowd = tree.query_ball_point(points, correlation_mm / 2, return_length=True).astype(float)
+    return np.concatenate([1 / crowd, np.ones(len(target.inflated))])
+
+
+def _covariance(problem: _Problem, rows: Residuals, du: Array, theta: Array) -> Array:
+    """Gauss-Newton covariance, widened by the misfit where the model explains less than the data's own noise would leave."""
+    whitening = problem.whiten(rows)
+    normal, _ = _normal_equations(problem, rows, whitening, du, theta)
+    weight = whitening**2 * problem.influence(rows)
+    freedom = max(float(weight.sum() * problem.settings.surface_sigma_mm**2) - len(theta), 1.0)
+    misfit = max(1.0, float((weight * rows.value**2).sum()) / freedom)
+    low, high = bounds(problem.system)
+    width = np.where(np.isfinite(high - low), high - low, 1.0)
+    # The box itself is knowledge: without it a parameter that the data do not see would have no variance at all.
+    normal[np.diag_indices(3)] += misfit * 12 / width[:3] ** 2
+    return misfit * np.linalg.inv(normal)
+
+
+def _rms(rows: Residuals, chosen: Array) -> float:
+    weight = rows.weight[chosen]
+    if not weight.sum():
+        return 0.0
+    squares = np.bincount(rows.group[chosen], rows.value[chosen] ** 2)
+    per_group = np.bincount(rows.group[chosen], weight) / np.maximum(np.bincount(rows.group[chosen]), 1)
+    return float(np.sqrt((squares * per_group).sum() / per_group.sum()))

@@ -1,0 +1,116 @@
+"""Which tetrahedron holds a point, and what a nodal field is worth there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit, prange
+
+from poro.mesh.closest import closest_points
+from poro.mesh.tetmesh import Array, TetMesh
+
+
+@dataclass(frozen=True)
+class Location:
+    """Where points lie in a mesh.
+
+    nodes: (q, 4) corners of the tetrahedron; barycentric: (q, 4); inside: (q,) bool; distance: (q,) mm, 0 inside.
+    Points outside carry the weights of the nearest point of the surface.
+    """
+
+    nodes: Array
+    barycentric: Array
+    inside: Array
+    distance: Array
+
+
+def locate(mesh: TetMesh, points: Array) -> Location:
+    """Tetrahedron and barycentric coordinates of points (q, 3) mm; outside, those of the nearest surface point."""
+    points = np.ascontiguousarray(points, float)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise ValueError(f"points must be (q, 3), got {points.shape}")
+    x = mesh.points[mesh.tets]
+    lower, upper = x.min(axis=1), x.max(axis=1)
+    origin = mesh.points.min(axis=0)
+    width = float(np.cbrt(mesh.volumes.mean() * 6))
+    shape = np.floor((mesh.points.max(axis=0) - origin) / width).astype(np.int64) + 1
+    first = np.clip(((lower - origin) / width).astype(np.int64), 0, shape - 1)
+    last = np.clip(((upper - origin) / width).astype(np.int64), 0, shape - 1)
+    start, members = _bins(first, last, shape)
+    tet, bary = _search(points, x[:, 0].copy(), mesh.gradients, origin, width, shape, start, members)
+    nodes = mesh.tets[np.maximum(tet, 0)]
+    distance = np.zeros(len(points))
+    lost = np.flatnonzero(tet < 0)
+    if len(lost):
+        surface = mesh.boundary
+        near = closest_points(surface, points[lost])
+        nodes[lost, :3] = surface.nodes[surface.triangles[near.triangle]]
+        nodes[lost, 3] = nodes[lost, 0]
+        bary[lost, :3] = near.barycentric
+        bary[lost, 3] = 0
+        distance[lost] = np.abs(near.distance)
+    return Location(nodes, bary, tet >= 0, distance)
+
+
+def interpolate(location: Location, nodal: Array) -> Array:
+    """Values (q, ...) of a nodal field (n, ...) at located points."""
+    return np.einsum("qk,qk...->q...", location.barycentric, nodal[location.nodes])
+
+
+@njit(cache=True)
+def _bins(first: Array, last: Array, shape: Array) -> tuple[Array, Array]:
+    """Tetrahedra whose boxes touch each cell of a uniform grid, as compressed rows."""
+    start = np.zeros(shape[0] * shape[1] * shape[2] + 1, np.int64)
+    for t in range(len(first)):
+        for i in range(first[t, 0], last[t, 0] + 1):
+            for j in range(first[t, 1], last[t, 1] + 1):
+                for k in range(first[t, 2], last[t, 2] + 1):
+                    start[(i * shape[1] + j) * shape[2] + k + 1] += 1
+    start = np.cumsum(start)
+    members = np.empty(start[-1], np.int64)
+    fill = start[:-1].copy()
+    for t in range(len(first)):
+        for i in range(first[t, 0], last[t, 0] + 1):
+            for j in range(first[t, 1], last[t, 1] + 1):
+                for k in range(first[t, 2], last[t, 2] + 1):
+                    cell = (i * shape[1] + j) * shape[2] + k
+                    members[fill[cell]] = t
+                    fill[cell] += 1
+    return start, members
+
+
+@njit(cache=True, parallel=True)
+def _search(
+    points: Array,
+    corner: Array,
+    gradients: Array,
+    origin: Array,
+    width: float,
+    shape: Array,
+    start: Array,
+    members: Array,
+) -> tuple[Array, Array]:
+    found = np.full(len(points), -1)
+    bary = np.zeros((len(points), 4))
+    for q in prange(len(points)):
+        i = int(np.floor((points[q, 0] - origin[0]) / width))
+        j = int(np.floor((points[q, 1] - origin[1]) / width))
+        k = int(np.floor((points[q, 2] - origin[2]) / width))
+        if i < 0 or j < 0 or k < 0 or i >= shape[0] or j >= shape[1] or k >= shape[2]:
+            continue
+        cell = (i * shape[1] + j) * shape[2] + k
+        for s in range(start[cell], start[cell + 1]):
+            t = members[s]
+            w1 = w2 = w3 = 0.0
+            for d in range(3):
+                offset = points[q, d] - corner[t, d]
+                w1 += gradients[t, 1, d] * offset
+                w2 += gradients[t, 2, d] * offset
+                w3 += gradients[t, 3, d] * offset
+            w0 = 1 - w1 - w2 - w3
+            if min(min(w0, w1), min(w2, w3)) >= -1e-9:
+                found[q] = t
+                bary[q, 0], bary[q, 1], bary[q, 2], bary[q, 3] = w0, w1, w2, w3
+                break
+    return found, bary

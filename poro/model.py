@@ -1,0 +1,211 @@
+"""The deflated lung: pressure, weight, hilum and load modes against cage and diaphragm. Ref: Alvarez 2021, sec. 7.2."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import Enum
+from functools import cached_property
+
+import numpy as np
+
+from poro.assembly import body_load, deformation_gradient, gradient_load
+from poro.compliance import Compliance
+from poro.contact import ContactState, ContactStatus, Obstacle, contact_sensitivity, settle
+from poro.flow import Flow
+from poro.levelset import level_set
+from poro.mesh.patches import patches, principal_axis
+from poro.mesh.tetmesh import Array, TetMesh
+from poro.modes import LoadMode
+from poro.solid import Solid, solid, unknowns_of
+from poro.tissue import GRAVITY_KPA_PER_MM, Tissue
+
+KAPPA_B_BOUNDS = (1e-14, 1e-4)
+PHI_BOUNDS = (0.0, 0.93)
+DIAPHRAGM_BOUNDS_MM = (0.0, 40.0)
+
+
+@dataclass(frozen=True)
+class Theta:
+    """Free parameters: kappa_b in 1/(Pa s), porosity phi, diaphragm travel in mm, and one amplitude per load mode."""
+
+    kappa_b: float
+    phi: float
+    d_diaph_mm: float = 0.0
+    modes: tuple[float, ...] = ()
+
+    def vector(self) -> Array:
+        """(log10 kappa_b, phi, d_diaph_mm, amplitudes...)."""
+        return np.array([np.log10(self.kappa_b), self.phi, self.d_diaph_mm, *self.modes])
+
+    @staticmethod
+    def of(vector: Array) -> Theta:
+        """Inverse of `vector`."""
+        return Theta(float(10 ** vector[0]), float(vector[1]), float(vector[2]), tuple(float(a) for a in vector[3:]))
+
+
+class PoroStatus(Enum):
+    """How a forward solution ended."""
+
+    SOLVED = "solved"
+    INVERTED = "solved, but some elements are turned inside out: linear strain is out of its range"
+    NOT_SETTLED = "contact did not settle"
+
+
+@dataclass(frozen=True)
+class PoroState:
+    """One deflated lung.
+
+    u: (n, 3) mm; p: (n,) kPa; contact_pressure: (n,) kPa; det_f: (m,); gap: (n,) mm, infinite off the contact nodes;
+    active: (n,) bool; iterations: outer contact steps; conflicts: contact nodes that the diaphragm has pushed behind the cage.
+    """
+
+    theta: Theta
+    u: Array
+    p: Array
+    contact_pressure: Array
+    det_f: Array
+    gap: Array
+    active: Array
+    iterations: int
+    conflicts: int
+    status: PoroStatus
+    contact: ContactState
+    log_pressure_change: Array
+
+    @property
+    def inverted_share(self) -> float:
+        """Share of elements with det F <= 0."""
+        return float((self.det_f <= 0).mean())
+
+
+@dataclass(frozen=True)
+class PoroSystem:
+    """Everything about one lung that no parameter changes: factor, compliance, obstacle and load responses."""
+
+    mesh: TetMesh
+    tissue: Tissue
+    gravity: Array
+    hilum: Array
+    hilum_displacement: Array
+    solid: Solid
+    flow: Flow
+    obstacle: Obstacle
+    contact_nodes: Array
+    compliance: Compliance
+    modes: tuple[LoadMode, ...] = ()
+    cage_offset: Array = field(default_factory=lambda: np.zeros(0))
+
+    @cached_property
+    def weight_response(self) -> Array:
+        """Displacements (n, 3) per kg/m3, without wall."""
+        return self.solid.solve(body_load(self.mesh, self.gravity * GRAVITY_KPA_PER_MM))
+
+    @cached_property
+    def hilum_response(self) -> Array:
+        """Displacements (n, 3) that the hilum's motion alone would cause."""
+        return self.solid.solve(np.zeros_like(self.mesh.points), self.hilum_displacement)
+
+    @cached_property
+    def mode_responses(self) -> Array:
+        """Displacements (n, 3, k) per unit amplitude of every load mode."""
+        n = len(self.mesh.points)
+        if not self.modes:
+            return np.zeros((n, 3, 0))
+        force = np.stack([mode.force for mode in self.modes], axis=2)
+        imposed = np.stack([mode.imposed for mode in self.modes], axis=2)[self.hilum]
+        return self.solid.solve(force, imposed)
+
+    @cached_property
+    def pressure_load(self) -> Array:
+        """Sparse (3n, n): nodal forces per kPa of pressure."""
+        return self.tissue.biot * gradient_load(self.mesh)
+
+
+def assemble(
+    mesh: TetMesh,
+    tissue: Tissue,
+    gravity: Array,
+    hilum: Array,
+    hilum_displacement: Array,
+    modes: tuple[LoadMode, ...] = (),
+    smooth_mm: float | None = None,
+) -> PoroSystem:
+    """Set a lung up once: factorize, build the cage from its own surface, find the diaphragm.
+
+    gravity: (3,) unit vector RAS; hilum: (k,) nodes whose displacements (k, 3) mm are imposed; smooth_mm: radius over which the
+    cage is rounded, by default one edge. Raises ValueError when gravity is not a unit vector or fewer than three nodes hold.
+    """
+    gravity = np.asarray(gravity, float)
+    if abs(np.linalg.norm(gravity) - 1) > 1e-3:
+        raise ValueError(f"gravity must be a unit vector, got length {np.linalg.norm(gravity):.3f}")
+    hilum = np.asarray(hilum)
+    if len(np.unique(hilum)) < 3 or hilum_displacement.shape != (len(hilum), 3):
+        raise ValueError(f"hilum needs three distinct nodes and displacements (k, 3), got {len(hilum)} nodes")
+    order = np.argsort(hilum)
+    hilum, hilum_displacement = hilum[order], np.asarray(hilum_displacement, float)[order]
+    body = solid(mesh, tissue, hilum)
+    boundary = mesh.boundary
+    edge = float(np.sqrt(boundary.areas.mean() * 4 / np.sqrt(3)))
+    level = level_set(boundary, 0.5 * edge, edge if smooth_mm is None else smooth_mm)
+    on_wall = ~np.isin(boundary.nodes, hilum)
+    nodes = boundary.nodes[on_wall]
+    rest = mesh.points[nodes]
+    moving = patches(boundary, mesh.points[hilum]).diaphragm[on_wall]
+    offset = np.minimum(level.evaluate(rest)[0], 0)
+    obstacle = Obstacle(level, rest, moving, principal_axis(mesh), offset)
+    place = np.full(3 * len(mesh.points), -1)
+    place[body.free_unknowns] = np.arange(len(body.free_unknowns))
+    compliance = Compliance(body.solver, place[unknowns_of(nodes)].reshape(-1, 3), len(body.free_unknowns))
+    flow = Flow(mesh, tissue)
+    return PoroSystem(mesh, tissue, gravity, hilum, hilum_displacement, body, flow, obstacle, nodes, compliance, modes)
+
+
+def solve(system: PoroSystem, theta: Theta, start: PoroState | None = None) -> PoroState:
+    """Deflated lung at one parameter value; `start`, any earlier state of this system, only saves iterations."""
+    if len(theta.modes) != len(system.modes):
+        raise ValueError(f"theta carries {len(theta.modes)} amplitudes, the system has {len(system.modes)} load modes")
+    p, change = system.flow.pressure(theta.kappa_b)
+    shape = system.mesh.points.shape
+    free = (
+        system.solid.solve((system.pressure_load @ p).reshape(shape))
+        + system.weight_response * system.tissue.density(theta.phi)
+        + system.hilum_response
+        + system.mode_responses @ np.array(theta.modes)
+    )
+    nodes = system.contact_nodes
+    contact = settle(
+        system.compliance, system.obstacle, free[nodes], theta.d_diaph_mm, start.contact if start else None
+    )
+    force = np.zeros(shape)
+    force[nodes] = contact.gradient * contact.force[:, None]
+    u = free + system.solid.solve(force)
+    det_f = np.linalg.det(deformation_gradient(system.mesh, u))
+    gap = np.full(len(u), np.inf)
+    gap[nodes] = contact.gap
+    pressure = np.zeros(len(u))
+    area = np.zeros(len(u))
+    area[system.mesh.boundary.nodes] = system.mesh.boundary.node_areas
+    pressure[nodes] = contact.force * np.linalg.norm(contact.gradient, axis=1) / area[nodes]
+    active = np.zeros(len(u), bool)
+    active[nodes] = contact.active
+    behind = system.obstacle.level.evaluate(system.obstacle.rest + u[nodes])[0] - system.obstacle.offset
+    conflicts = int(((behind < -0.5) & system.obstacle.moving).sum())
+    status = PoroStatus.INVERTED if (det_f <= 0).any() else PoroStatus.SOLVED
+    if contact.status is ContactStatus.STOPPED:
+        status = PoroStatus.NOT_SETTLED
+    return PoroState(theta, u, p, pressure, det_f, gap, active, contact.steps, conflicts, status, contact, change)
+
+
+def sensitivity(system: PoroSystem, state: PoroState) -> Array:
+    """Derivatives of u by the entries of Theta.vector(), (n, 3, 3 + k), at the state's active set."""
+    n = len(system.mesh.points)
+    pressure_force = (system.pressure_load @ state.log_pressure_change).reshape(n, 3) * np.log(10)
+    by_phi = system.weight_response * (system.tissue.density_fluid - system.tissue.density_solid)
+    parts = [system.solid.solve(pressure_force), by_phi, np.zeros((n, 3))]
+    free = np.concatenate([np.stack(parts, axis=2), system.mode_responses], axis=2)
+    travel = np.zeros(free.shape[2])
+    travel[2] = 1
+    nodes = system.contact_nodes
+    force = np.zeros_like(free)
+    force[nodes] = contact_sensitivity(system.compliance, system.obstacle, state.contact, free[nodes], travel)
+    return free + system.solid.solve(force)

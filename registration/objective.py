@@ -1,0 +1,51 @@
+"""A sum of terms to be minimized over B-spline coefficients c (3, ni, nj, nk), mm."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from registration.volume import Array
+
+
+@dataclass(frozen=True)
+class Model:
+    """A term near c. value; gradient: (3, ni, nj, nk), exact; apply: d -> H d with H a positive semidefinite
+    Gauss-Newton Hessian; diagonal: that of H, (3, ni, nj, nk)."""
+
+    value: float
+    gradient: Array
+    apply: Callable[[Array], Array]
+    diagonal: Array
+
+
+class Term(Protocol):
+    """One summand: its value alone, and its model near c."""
+
+    def value(self, c: Array) -> float: ...
+
+    def model(self, c: Array) -> Model: ...
+
+
+@dataclass(frozen=True)
+class Objective:
+    """Sum of terms, itself a term."""
+
+    terms: Sequence[Term]
+
+    def value(self, c: Array) -> float:
+        """Sum of the terms' values."""
+        return sum(term.value(c) for term in self.terms)
+
+    def model(self, c: Array) -> Model:
+        """Sum of the terms' models."""
+        models = [term.model(c) for term in self.terms]
+        return Model(
+            sum(m.value for m in models),
+            np.sum([m.gradient for m in models], axis=0),
+            lambda d: np.sum([m.apply(d) for m in models], axis=0),
+            np.sum([m.diagonal for m in models], axis=0),
+        )

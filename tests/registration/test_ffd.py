@@ -1,0 +1,179 @@
+"""Free-form deformation: known maps by value and sign, what holds it back, and no folding."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from registration.bspline import BSplineField, control_grid
+from registration.ffd import FfdSettings, Weights, register_ffd
+from registration.newton import Stop
+from registration.penalties import Keypoints
+from registration.rigid import RigidTransform
+from registration.sliding import grown, masked, register_sliding
+from registration.volume import Array, Grid, Mask, Volume
+from tests.registration.scenes import image_of, make_pattern, oriented
+
+CENTRE = np.array([10.0, -30.0, 120.0])
+GRID = oriented("LPS", (40, 38, 36), 2.5, CENTRE)
+WIDE = oriented("RAS", (64, 64, 64), 2.5, CENTRE)
+PATTERN = make_pattern(4)
+INNER = GRID.to_ras(np.random.default_rng(2).uniform(6, 29, (300, 3)))
+COARSE = FfdSettings(levels=3, voxel_mm=2.5)
+
+
+def wave(points: Array) -> Array:
+    """A smooth map that moves points by up to 6 mm, twists, and shrinks along S."""
+    x, y, z = (points - CENTRE).T
+    u = np.stack([4 * np.sin(y / 30) + 1, 3 * np.cos(z / 25) - 2, -0.08 * z + 2 * np.sin(x / 35)], axis=1)
+    return points + u
+
+
+def error(got: Array, expected: Array) -> Array:
+    return np.asarray(np.linalg.norm(got - expected, axis=1))
+
+
+@pytest.mark.parametrize("window_mm", [14.0, None])
+def test_a_known_map_comes_back(window_mm: float | None) -> None:
+    fixed, moving = image_of(lambda p: PATTERN(wave(p)), GRID), image_of(PATTERN, WIDE)
+    fit = register_ffd(fixed, moving, FfdSettings(levels=3, voxel_mm=2.5, window_mm=window_mm))
+    assert error(INNER, wave(INNER)).mean() > 3
+    assert error(fit.moving_from_fixed(INNER), wave(INNER)).mean() < 0.15
+    assert error(fit.moving_from_fixed(INNER), wave(INNER)).max() < 0.8
+    assert fit.folded_share == 0
+    assert fit.status in (Stop.CONVERGED, Stop.SMALL_STEP)
+
+
+def test_it_corrects_a_rigid_prior_through_gain_and_offset() -> None:
+    prior = RigidTransform.about(CENTRE, np.array([0.05, 0.1, -0.15]), np.array([20.0, -10.0, 5.0]))
+    fixed = image_of(lambda p: 0.7 * PATTERN(prior(wave(p))) + 90, GRID)
+    moving = image_of(PATTERN, oriented("RAS", (64, 64, 64), 2.5, prior(CENTRE[None])[0]))
+    fit = register_ffd(fixed, moving, COARSE, prior=prior)
+    assert error(fit.moving_from_fixed(INNER), prior(wave(INNER))).mean() < 0.2
+    dense = fit.moving_from_fixed.dense(GRID)
+    assert error(dense(INNER), fit.moving_from_fixed(INNER)).max() < 0.2
+
+
+def test_the_history_never_rises_within_a_level() -> None:
+    fit = register_ffd(image_of(lambda p: PATTERN(wave(p)), GRID), image_of(PATTERN, WIDE), COARSE)
+    assert len(fit.history) == 3
+    for level in fit.history:
+        assert np.all(np.diff(level) < 1e-6)
+
+
+def test_mass_preservation_reads_density_as_volume() -> None:
+    """A uniform sponge squeezed along S: HU alone carries the map, and only through the determinant."""
+    squeeze = 0.85
+
+    def mapped(p: Array) -> Array:
+        return np.asarray(CENTRE + (p - CENTRE) * [1.0, 1.0, 1 / squeeze])
+
+    sponge = image_of(lambda p: PATTERN(p) * 0.3 - 700, WIDE)
+    fixed = image_of(lambda p: (PATTERN(mapped(p)) * 0.3 + 300) / squeeze - 1000, GRID)
+    settings = FfdSettings(levels=3, voxel_mm=2.5, window_mm=None, mass_preserving=True)
+    fit = register_ffd(fixed, sponge, settings)
+    assert error(fit.moving_from_fixed(INNER), mapped(INNER)).mean() < 0.25
+    det = fit.moving_from_fixed.dense(GRID).jacobian_determinant()[8:-8, 8:-8, 8:-8]
+    assert_allclose(det.mean(), 1 / squeeze, rtol=0.02)
+
+
+def test_samples_that_leave_the_moving_view_do_not_pull() -> None:
+    """Half of the moving image is unseen and holds rubbish; the seen half must register as if it were not there."""
+    moving = image_of(PATTERN, WIDE)
+    seen = WIDE.points()[..., 0] < CENTRE[0] + 6
+    rubbish = np.where(seen, moving.hu, np.random.default_rng(0).uniform(-1000, 500, WIDE.shape)).astype(np.float32)
+    fixed = image_of(lambda p: PATTERN(wave(p)), GRID)
+    fit = register_ffd(fixed, Volume(rubbish, WIDE.ras_from_ijk), COARSE, moving_mask=Mask(seen, WIDE.ras_from_ijk))
+    far = INNER[INNER[:, 0] < CENTRE[0] - 8]
+    assert error(fit.moving_from_fixed(far), wave(far)).mean() < 0.25
+
+
+def test_keypoints_lead_beyond_the_capture_range() -> None:
+    stripes = make_pattern(6, waves=80, shortest_mm=4.0)
+    fine = oriented("RAS", (110, 110, 110), 1.25, CENTRE)
+    grid = oriented("LPS", (48, 46, 44), 1.25, CENTRE)
+    push = np.array([0.0, 16.0, -12.0])
+    fixed = image_of(lambda p: stripes(p + push), grid)
+    moving = image_of(stripes, fine)
+    points = grid.to_ras(np.random.default_rng(1).uniform(4, 40, (60, 3)))
+    matches = Keypoints(points, points + push, np.ones(60))
+    matches.moving[:6] += 40.0
+    settings = FfdSettings(levels=1, voxel_mm=1.25, window_mm=8.0)
+    without = register_ffd(fixed, moving, settings)
+    guided = register_ffd(fixed, moving, settings, keypoints=matches)
+    assert error(without.moving_from_fixed(points), points + push).mean() > 5
+    assert error(guided.moving_from_fixed(points[6:]), points[6:] + push).mean() < 0.5
+
+
+def test_contradictory_keypoints_cannot_fold_the_map() -> None:
+    rng = np.random.default_rng(3)
+    points = GRID.to_ras(rng.uniform(10, 25, (30, 3)))
+    crossing = Keypoints(points, 2 * CENTRE - points, np.ones(30), 50.0)
+    blank = image_of(lambda p: 0 * p[:, 0], GRID)
+    strong = FfdSettings(levels=2, voxel_mm=2.5, weights=Weights(bending=1.0, keypoints=1.0))
+    fit = register_ffd(blank, blank, strong, keypoints=crossing)
+    assert fit.min_det > 0
+    assert fit.folded_share == 0
+    moved = fit.moving_from_fixed(points) - CENTRE
+    assert np.linalg.norm(moved, axis=1).mean() < 0.7 * np.linalg.norm(points - CENTRE, axis=1).mean()
+
+
+def test_a_heavy_prior_keeps_the_map_at_home() -> None:
+    fixed, moving = image_of(lambda p: PATTERN(wave(p)), GRID), image_of(PATTERN, WIDE)
+    fit = register_ffd(fixed, moving, FfdSettings(levels=2, voxel_mm=2.5, weights=Weights(prior=100.0)))
+    assert error(fit.moving_from_fixed(INNER), INNER).max() < 0.1
+
+
+def test_an_empty_mask_is_refused() -> None:
+    blank = image_of(PATTERN, GRID)
+    empty = Mask(np.zeros(GRID.shape, dtype=bool), GRID.ras_from_ijk)
+    with pytest.raises(ValueError, match="mask is empty"):
+        register_ffd(blank, blank, COARSE, fixed_mask=empty)
+
+
+def test_a_lung_slides_past_a_wall_that_stays() -> None:
+    """A ball moves 12 mm along S inside a patterned wall that does not; masked images follow the ball."""
+    wall, lung = make_pattern(7), make_pattern(8)
+    slide = np.array([0.0, 0.0, 12.0])
+    radius = 36.0
+
+    def scene(points: Array, shift: Array) -> Array:
+        inside = np.hypot(*(points - CENTRE)[:, :2].T) < radius
+        return np.where(inside, 0.4 * lung(points + shift) - 600, 0.4 * wall(points) + 300)
+
+    grid = oriented("LPS", (44, 44, 30), 2.5, CENTRE)
+    fixed = image_of(lambda p: scene(p, slide), grid)
+    moving = image_of(lambda p: scene(p, np.zeros(3)), WIDE)
+
+    def tube(g: Grid) -> Mask:
+        return Mask(np.hypot(*np.moveaxis(g.points() - CENTRE, 3, 0)[:2]) < radius, g.ras_from_ijk)
+
+    fit = register_sliding(fixed, moving, tube(WIDE), COARSE, fixed_lung=tube(grid))
+    rng = np.random.default_rng(5)
+    angle, r = rng.uniform(0, 2 * np.pi, 200), rng.uniform(26, 34, 200)
+    near = CENTRE + np.stack([r * np.cos(angle), r * np.sin(angle), rng.uniform(-20, 20, 200)], axis=1)
+    assert error(fit.moving_from_fixed(near), near + slide).mean() < 0.5
+    plain = register_ffd(fixed, moving, COARSE)
+    assert error(plain.moving_from_fixed(near), near + slide).mean() > 2.0
+
+
+def test_masking_and_growing_by_value() -> None:
+    grid = Grid((21, 21, 21), np.diag([1.0, 1.0, 2.0, 1.0]))
+    inside = np.zeros(grid.shape, dtype=bool)
+    inside[10, 10, 10] = True
+    lung = Mask(inside, grid.ras_from_ijk)
+    ball = grown(lung, 5.0).inside
+    assert ball[15, 10, 10]
+    assert not ball[16, 10, 10]
+    assert ball[10, 10, 12]
+    assert not ball[10, 10, 13]
+    hu = masked(Volume(np.full(grid.shape, -500, np.float32), grid.ras_from_ijk), lung).hu
+    assert hu[10, 10, 10] == -500
+    assert hu[9, 10, 10] == -1100
+
+
+def test_fields_of_a_fit_lie_on_grids_parallel_to_the_fixed_image() -> None:
+    control = control_grid(GRID, 16.0)
+    spline = BSplineField(np.zeros((*control.shape, 3)), control.ras_from_ijk)
+    assert spline.dense(GRID).grid.same_as(GRID)

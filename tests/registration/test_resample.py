@@ -1,0 +1,88 @@
+"""Images seen through maps: exact on linear scenes, the same in every orientation, known shifts by value and sign."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.spatial.transform import Rotation
+
+from registration.field import DisplacementField, sample_map
+from registration.resample import coarsen, resample, resample_mask, smooth
+from registration.rigid import RigidTransform
+from registration.volume import Array, Grid, Mask, Volume
+from tests.registration.scenes import image_of, make_pattern, oriented, tilted
+
+CENTRE = np.array([20.0, -40.0, 90.0])
+TILT = Rotation.from_rotvec([0.2, -0.35, 0.5]).as_matrix()
+
+
+def linear(points: Array) -> Array:
+    return 3.0 * points[:, 0] - 2.0 * points[:, 1] + 0.5 * points[:, 2] - 400.0
+
+
+@pytest.mark.parametrize("codes", ["RAS", "LAS", "LPS", "SAR", "PIR"])
+@pytest.mark.parametrize("tilt", [np.eye(3), TILT])
+def test_a_linear_scene_survives_any_orientation_and_rigid_map(codes: str, tilt: Array) -> None:
+    moving = image_of(linear, tilted(oriented(codes, (60, 60, 60), 2.0, CENTRE), tilt))
+    target = oriented("RAS", (12, 10, 8), 3.0, CENTRE)
+    move = RigidTransform.about(CENTRE, np.array([0.1, 0.2, -0.1]), np.array([4.0, -3.0, 5.0]))
+    got = resample(moving, target, move)
+    assert_allclose(got.hu.ravel(), linear(move(target.points().reshape(-1, 3))), atol=2e-3)
+
+
+def test_oblique_round_trip_returns_the_scene() -> None:
+    pattern = make_pattern(3, shortest_mm=30.0)
+    straight = oriented("LPS", (50, 50, 50), 1.5, CENTRE)
+    volume = image_of(pattern, straight)
+    oblique = tilted(oriented("RAS", (90, 90, 90), 1.0, CENTRE), TILT)
+    back = resample(resample(volume, oblique), straight)
+    core = (slice(12, -12),) * 3
+    assert np.abs(back.hu[core] - volume.hu[core]).max() < 5.0
+
+
+@pytest.mark.parametrize("shift", [(6.0, -4.0, 3.0), (0.0, 0.0, -5.0)])
+def test_a_shift_moves_a_blob_against_the_map(shift: tuple[float, float, float]) -> None:
+    grid = oriented("LPS", (40, 40, 40), 1.0, CENTRE)
+    blob = image_of(lambda p: 1000 * np.exp(-np.sum((p - CENTRE) ** 2, axis=1) / 18) - 1000, grid)
+    seen = resample(blob, grid, lambda p: p + np.array(shift))
+    mass = (seen.hu + 1000).ravel()
+    assert_allclose(mass @ grid.points().reshape(-1, 3) / mass.sum(), CENTRE - shift, atol=0.02)
+
+
+def test_a_field_on_the_same_grid_and_the_map_it_samples_agree() -> None:
+    pattern = make_pattern(1)
+    grid = oriented("LPS", (30, 28, 26), 2.0, CENTRE)
+    move = RigidTransform.about(CENTRE, np.array([0.0, 0.1, 0.05]), np.array([1.0, 2.0, 3.0]))
+    volume = image_of(pattern, grid)
+    assert_allclose(resample(volume, grid, sample_map(move, grid)).hu, resample(volume, grid, move).hu, atol=0.05)
+
+
+def test_outside_takes_the_fill_value() -> None:
+    grid = Grid((4, 4, 4), np.eye(4))
+    seen = resample(Volume(np.zeros((4, 4, 4), np.float32), np.eye(4)), grid, lambda p: p + [2.5, 0, 0], fill=-77)
+    assert_allclose(seen.hu[0], 0)
+    assert_allclose(seen.hu[1:], -77)
+
+
+def test_a_mask_keeps_its_volume_on_a_finer_tilted_grid() -> None:
+    grid = oriented("RAS", (40, 40, 40), 2.0, CENTRE)
+    ball = Mask(np.linalg.norm(grid.points() - CENTRE, axis=3) < 25, grid.ras_from_ijk)
+    fine = tilted(oriented("RAS", (90, 90, 90), 1.0, CENTRE), TILT)
+    assert_allclose(resample_mask(ball, fine).inside.sum(), 4 / 3 * np.pi * 25**3, rtol=0.01)
+
+
+def test_coarsening_and_smoothing_keep_linear_scenes_and_damp_waves_as_a_gaussian() -> None:
+    grid = oriented("LPS", (60, 60, 60), 1.0, CENTRE)
+    coarse = coarsen(image_of(linear, grid), 3.0)
+    core = (slice(3, -3),) * 3
+    expected = linear(coarse.grid.points().reshape(-1, 3)).reshape(coarse.grid.shape)
+    assert_allclose(coarse.hu[core], expected[core], atol=1e-2)
+    wave = image_of(lambda p: 100 * np.cos(2 * np.pi * p[:, 2] / 12), grid)
+    damped = smooth(wave, 2.0).hu[:, :, 10:-10]
+    assert_allclose(damped, wave.hu[:, :, 10:-10] * np.exp(-2 * (np.pi * 2 / 12) ** 2), atol=0.5)
+
+
+def test_a_displacement_field_refuses_scalars() -> None:
+    with pytest.raises(ValueError, match=r"\(ni, nj, nk, 3\), got \(2, 2, 2\)"):
+        DisplacementField(np.zeros((2, 2, 2)), np.eye(4))

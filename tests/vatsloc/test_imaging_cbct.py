@@ -1,0 +1,88 @@
+"""Field of view, cupping and spine in images whose truth is known."""
+
+from __future__ import annotations
+
+import imaging_thorax as known
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from registration.volume import Volume
+from vatsloc.errors import InputRefused
+from vatsloc.imaging.cbct import field_of_view, prepare_cbct
+from vatsloc.imaging.spine import segment_spine
+
+
+def test_cylinder_and_bad_slices_are_found() -> None:
+    cbct = known.cone_beam(known.thorax().volume, (30.0, -10.0), 90.0)
+    field = field_of_view(cbct)
+    centre = cbct.grid.to_ras(np.array([*field.centre_ij, 0.0]))
+    assert field.axis == 2
+    assert_allclose(centre[:2], [30.0, -10.0], atol=0.5)
+    assert_allclose(field.radius_mm, 90.0, atol=1.5)
+    slices = np.flatnonzero(field.usable.inside.any(axis=(0, 1)))
+    ends = int(np.ceil(12.0 / known.SPACING))
+    assert (slices[0], slices[-1]) == (ends, known.SHAPE[2] - ends - 1)
+
+
+def test_cylinder_cut_by_the_image_keeps_its_circle() -> None:
+    whole = known.cone_beam(known.thorax().volume, (30.0, -10.0), 120.0)
+    field = field_of_view(whole)
+    centre = whole.grid.to_ras(np.array([*field.centre_ij, 0.0]))
+    assert_allclose(centre[:2], [30.0, -10.0], atol=2.0)
+    assert_allclose(field.radius_mm, 120.0, atol=3.0)
+
+
+def test_image_without_a_rim_is_seen_whole() -> None:
+    field = field_of_view(known.thorax().volume)
+    assert field.mask.inside.all()
+    assert field.radius_mm == np.inf
+
+
+def test_short_or_empty_cbct_is_refused() -> None:
+    cbct = known.cone_beam(known.thorax().volume, (30.0, -10.0), 90.0)
+    with pytest.raises(InputRefused, match=r"8 slices with content, 11 needed"):
+        field_of_view(Volume(cbct.hu[:, :, :8].copy(), cbct.ras_from_ijk))
+    with pytest.raises(InputRefused, match="constant everywhere"):
+        field_of_view(Volume(np.full((20, 20, 20), -1000, dtype=np.float32), cbct.ras_from_ijk))
+
+
+@pytest.mark.parametrize("cupping", [(-90.0, 10.0), (-40.0, -40.0), (0.0, 60.0)])
+def test_cupping_is_recovered_and_removed(cupping: tuple[float, float]) -> None:
+    truth = known.thorax().volume
+    cbct = known.cone_beam(truth, (30.0, -20.0), 100.0, cupping)
+    done = prepare_cbct(cbct)
+    radius = np.linspace(20.0, 90.0, 8)
+    assert_allclose(done.removed.at(radius), np.interp(radius, [0.0, 100.0], cupping), atol=15.0)
+    soft = done.field.usable.inside & (np.abs(truth.hu - 40) < 30)
+    assert_allclose(np.median(done.volume.hu[soft]), 40.0, atol=10.0)
+    assert_allclose(done.removed.after["soft"], 40.0, atol=12.0)
+
+
+def test_lost_contrast_is_given_back() -> None:
+    truth = known.thorax().volume
+    squeezed = Volume((40 + 0.8 * (truth.hu - 40)).astype(np.float32), truth.ras_from_ijk)
+    done = prepare_cbct(known.cone_beam(squeezed, (30.0, -20.0), 100.0, (-50.0, 0.0)))
+    assert_allclose(done.removed.gain, 0.8, atol=0.03)
+    lung = known.thorax().lungs["right"].inside & done.field.usable.inside
+    assert_allclose(np.median(done.volume.hu[lung]), -850.0, atol=30.0)
+
+
+def test_spine_is_the_column_of_vertebrae_in_ct_and_cbct() -> None:
+    scene = known.thorax()
+    done = prepare_cbct(known.cone_beam(scene.volume, (30.0, -20.0), 100.0))
+    for spine, seen in (
+        (segment_spine(scene.volume), np.ones(known.SHAPE, dtype=bool)),
+        (segment_spine(done.volume, done.field.usable), done.field.usable.inside),
+    ):
+        assert_allclose(spine.centres_ras[:, 0], 0.0, atol=4.0)
+        assert_allclose(spine.centres_ras[:, 1], -58.0, atol=8.0)
+        assert spine.mask.inside[scene.vertebrae.inside & seen].mean() > 0.97
+        assert spine.mask.inside.sum() < 4.0 * (scene.vertebrae.inside & seen).sum()
+
+
+def test_image_without_bone_has_no_spine() -> None:
+    scene = known.thorax()
+    hu = np.where(scene.volume.hu > 150, np.float32(40), scene.volume.hu)
+    with pytest.raises(InputRefused, match="No spine found"):
+        segment_spine(Volume(hu, scene.volume.ras_from_ijk))

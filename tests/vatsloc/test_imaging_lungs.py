@@ -1,0 +1,116 @@
+"""Lungs, sides, airways and refusals in a CT that is known exactly."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import imaging_thorax as known
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from registration.volume import Mask, Volume
+from vatsloc.errors import InputRefused
+from vatsloc.imaging.hilum import find_hilum
+from vatsloc.imaging.lungs import segment_lungs
+
+
+def ball(centre: tuple[float, float, float], radius: float) -> Mask:
+    g = known.grid()
+    return Mask(np.linalg.norm(g.points() - np.array(centre), axis=-1) < radius, g.ras_from_ijk)
+
+
+@pytest.mark.parametrize("touching", [False, True])
+def test_lungs_match_the_ellipsoids_and_know_their_sides(touching: bool) -> None:
+    scene = known.thorax(touching=touching)
+    lungs = segment_lungs(scene.volume, "right")
+    assert known.dice(lungs.right, scene.lungs["right"]) > 0.96
+    assert known.dice(lungs.left, scene.lungs["left"]) > 0.96
+    assert not (lungs.left.inside & lungs.right.inside).any()
+    assert abs(lungs.midline_r) < 5.0
+    expected = 4 / 3 * np.pi * known.HALF_AXES.prod() / 1000
+    assert_allclose(lungs.volume_ml["left"], expected, rtol=0.05)
+
+
+@pytest.mark.parametrize("flips", [(1, 1, 1), (-1, -1, 1), (1, -1, -1)])
+def test_sides_do_not_depend_on_how_voxels_are_stored(flips: tuple[int, int, int]) -> None:
+    scene = known.thorax()
+    hu, affine = scene.volume.hu, scene.volume.ras_from_ijk.copy()
+    for axis, sign in enumerate(flips):
+        if sign < 0:
+            hu = np.flip(hu, axis)
+            affine[:3, 3] += affine[:3, axis] * (hu.shape[axis] - 1)
+            affine[:3, axis] *= -1
+    lungs = segment_lungs(Volume(np.ascontiguousarray(hu.transpose(2, 0, 1)), affine[:, [2, 0, 1, 3]]), "left")
+    inside = lungs.left.grid.to_ras(np.argwhere(lungs.left.inside).astype(float))
+    assert_allclose(inside.mean(axis=0), known.CENTRES["left"], atol=3.0)
+
+
+def test_airways_are_the_tree_and_do_not_leak() -> None:
+    scene = known.thorax()
+    lungs = segment_lungs(scene.volume, "right")
+    assert known.dice(lungs.airways, scene.airways) > 0.85
+
+
+def test_hilum_lies_where_the_bronchus_enters() -> None:
+    scene = known.thorax()
+    lungs = segment_lungs(scene.volume, "right")
+    hilum = find_hilum(lungs.right, lungs.airways, "right")
+    assert hilum.on_airways
+    assert_allclose(hilum.point_ras, [33.0, 5.0, 1.0], atol=8.0)
+    guessed = find_hilum(lungs.left, Mask(np.zeros_like(lungs.left.inside), lungs.left.ras_from_ijk), "left")
+    assert not guessed.on_airways
+    assert -45.0 < guessed.point_ras[0] < -20.0
+
+
+def test_nodule_at_the_pleura_belongs_to_the_lung() -> None:
+    scene = known.thorax()
+    place = (known.CENTRES["right"][0] + known.HALF_AXES[0] - 2.0, 10.0, -10.0)
+    nodule = ball(place, 7.0)
+    hu = np.where(nodule.inside, np.float32(30), scene.volume.hu)
+    lungs = segment_lungs(Volume(hu, scene.volume.ras_from_ijk), "right", nodule)
+    assert lungs.right.inside[nodule.inside].all()
+    assert known.dice(lungs.right, scene.lungs["right"]) > 0.95
+
+
+def test_dense_patch_in_the_lung_is_kept() -> None:
+    scene = known.thorax()
+    patch = ball((75.0, 0.0, -40.0), 14.0)
+    hu = np.where(patch.inside, np.float32(20), scene.volume.hu)
+    lungs = segment_lungs(Volume(hu, scene.volume.ras_from_ijk), "right")
+    assert lungs.right.inside[patch.inside].mean() > 0.99
+
+
+def test_nodule_in_the_other_lung_is_refused() -> None:
+    with pytest.raises(InputRefused, match=r'lies in the left lung.*set side = "left"'):
+        segment_lungs(known.thorax().volume, "right", nodule_ras=np.array([-70.0, 0.0, 0.0]))
+
+
+def test_nodule_far_from_both_lungs_is_refused() -> None:
+    with pytest.raises(InputRefused, match=r"mm outside the right lung, 15 mm allowed"):
+        segment_lungs(known.thorax().volume, "right", nodule_ras=np.array([100.0, -60.0, 100.0]))
+    with pytest.raises(InputRefused, match=r"outside the CT; give it in the CT's frame"):
+        segment_lungs(known.thorax().volume, "right", nodule_ras=np.array([500.0, 0.0, 0.0]))
+
+
+def test_ct_without_a_lung_is_refused() -> None:
+    scene = known.thorax()
+    hu = np.where(scene.lungs["left"].inside | scene.lungs["right"].inside, np.float32(40), scene.volume.hu)
+    with pytest.raises(InputRefused, match=r"shows no lung: \d+ ml .* give a chest CT"):
+        segment_lungs(Volume(hu, scene.volume.ras_from_ijk), "right")
+
+
+def test_ct_without_the_operated_lung_is_refused() -> None:
+    with pytest.raises(InputRefused, match=r'0 ml of the left lung, 250 ml needed.*side = "left"'):
+        segment_lungs(known.thorax(one_lung=True).volume, "left")
+
+
+@pytest.mark.shared
+@pytest.mark.parametrize(("name", "litres"), [("twin-a", (2.4, 2.8)), ("twin-b", (1.6, 1.9))])
+def test_lungs_of_a_real_ct_are_plausible(shared: Path, name: str, litres: tuple[float, float]) -> None:
+    from vatsloc.case import read_case
+
+    case = read_case(shared / "cases" / name)
+    lungs = segment_lungs(case.ct, case.side)
+    assert litres[0] < lungs.volume_ml[case.side] / 1000 < litres[1]
+    assert 10.0 < lungs.airways.inside.sum() * lungs.airways.grid.spacing.prod() / 1000 < 80.0

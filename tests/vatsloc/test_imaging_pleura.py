@@ -1,0 +1,178 @@
+"""Collapsed lung, pleural air, airways and surfaces in CBCTs whose truth is known."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import imaging_thorax as known
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from registration.volume import Mask, Volume
+from vatsloc.errors import InputRefused
+from vatsloc.imaging.cbct import PreparedCbct, prepare_cbct
+from vatsloc.imaging.hilum import track_hilum
+from vatsloc.imaging.lungs import segment_lungs
+from vatsloc.imaging.pleura import Pneumothorax, find_pneumothorax
+from vatsloc.imaging.surface import Border, deflated_surface, diaphragm_points
+from vatsloc.imaging.thorax import ThoraxPrior, carry_prior, inflated_lung, require_share, visible_share
+
+SHRUNK = 0.72
+
+
+def same(points: np.ndarray) -> np.ndarray:
+    return points
+
+
+def to_ellipsoid(points: np.ndarray, scale: float) -> np.ndarray:
+    """Signed distance in mm, first order, positive outside the collapsed lung."""
+    centre = known.CENTRES["right"] - np.array([known.HALF_AXES[0] * (1 - scale), 0.0, 0.0])
+    y = (points - centre) / (known.HALF_AXES * scale)
+    f = np.linalg.norm(y, axis=1)
+    return f * (f - 1) / np.linalg.norm(y / (known.HALF_AXES * scale), axis=1)
+
+
+@pytest.fixture(scope="module")
+def prior() -> ThoraxPrior:
+    scene = known.thorax()
+    return carry_prior(segment_lungs(scene.volume, "right"), "right", scene.volume, same)
+
+
+@pytest.fixture(scope="module")
+def deflated() -> PreparedCbct:
+    return prepare_cbct(known.cone_beam(known.thorax(scale_right=SHRUNK).volume, (50.0, 0.0), 110.0))
+
+
+@pytest.fixture(scope="module")
+def found(deflated: PreparedCbct, prior: ThoraxPrior) -> Pneumothorax:
+    return find_pneumothorax(deflated, prior)
+
+
+def test_inflated_lung_matches_in_spite_of_a_displaced_prior() -> None:
+    scene = known.thorax()
+    cbct = prepare_cbct(known.cone_beam(scene.volume, (50.0, 0.0), 110.0))
+    shift = np.array([6.0, -5.0, 8.0])
+    lungs = segment_lungs(scene.volume, "right")
+    moved = inflated_lung(cbct, carry_prior(lungs, "right", cbct.volume, lambda p: p + shift))
+    seen = cbct.field.mask.inside
+    truth = Mask(scene.lungs["right"].inside & seen, moved.ras_from_ijk)
+    assert known.dice(moved, truth) > 0.95
+
+
+def test_visible_share_is_the_share_of_the_volume() -> None:
+    scene = known.thorax()
+    lung = scene.lungs["right"]
+    half = known.cone_beam(scene.volume, (50.0, 0.0), 110.0)
+    cut = Volume(half.hu[:, :, : known.SHAPE[2] // 2].copy(), half.ras_from_ijk)
+    cbct = prepare_cbct(cut)
+    points = lung.grid.to_ras(np.argwhere(lung.inside).astype(float))
+    ijk = np.rint(cbct.field.usable.grid.to_ijk(points)).astype(int)
+    within = ijk[:, 2] < cut.hu.shape[2]
+    expected = cbct.field.usable.inside[tuple(ijk[within].T)].sum() / len(points)
+    assert_allclose(visible_share(lung, cbct.field, same), expected, atol=0.03)
+
+
+def test_too_small_a_share_is_refused_in_one_sentence() -> None:
+    require_share(0.41, "right")
+    with pytest.raises(InputRefused) as refused:
+        require_share(0.12, "right")
+    assert str(refused.value) == (
+        "CBCT shows 12 % of the right lung, 40 % needed; re-crop, or lower [gates] min_overlap."
+    )
+
+
+def test_pleural_air_and_collapsed_lung_are_told_apart(found: Pneumothorax) -> None:
+    truth = known.thorax(scale_right=SHRUNK).lungs["right"]
+    assert found.is_collapsed
+    assert found.lung.grid.same_as(truth.grid)
+    assert known.dice(found.lung, truth) > 0.95
+    old = known.thorax().lungs["right"].inside
+    air = Mask(old & ~truth.inside & (known.thorax().volume.hu < -500), truth.ras_from_ijk)
+    assert known.dice(found.air, air) > 0.9
+    assert not (found.air.inside & known.thorax().lungs["left"].inside).any()
+
+
+def test_air_border_lies_on_the_ellipsoid_and_normals_point_out(found: Pneumothorax, deflated: PreparedCbct) -> None:
+    air = deflated_surface(found, deflated.field).only(Border.AIR)
+    assert len(air) > 1000
+    distance = to_ellipsoid(air.points, SHRUNK)
+    assert abs(distance.mean()) < 0.3
+    assert np.percentile(np.abs(distance), 95) < 1.2
+    centre = known.CENTRES["right"] - np.array([known.HALF_AXES[0] * (1 - SHRUNK), 0.0, 0.0])
+    outward = (air.points - centre) / (known.HALF_AXES * SHRUNK) ** 2
+    outward /= np.linalg.norm(outward, axis=1, keepdims=True)
+    assert np.percentile((outward * air.normals).sum(axis=1), 5) > 0.9
+    assert (air.confidence > 0.9).mean() > 0.95
+
+
+def test_surface_keeps_away_from_the_rim_and_bad_slices(found: Pneumothorax, deflated: PreparedCbct) -> None:
+    points = deflated_surface(found, deflated.field).points
+    assert np.hypot(points[:, 0] - 50.0, points[:, 1]).max() < 110.0 - 3.0
+    half_height = known.SPACING * (known.SHAPE[2] - 1) / 2
+    assert np.abs(points[:, 2]).max() < half_height - 12.0
+
+
+def test_gap_between_two_pieces_of_lung_is_a_fissure(deflated: PreparedCbct, prior: ThoraxPrior) -> None:
+    x = deflated.volume.grid.points()
+    gap = (np.abs(x[..., 2] + 10.0) < 4.0) & (x[..., 0] > 45.0) & (np.abs(x[..., 1]) < 60.0)
+    lung = known.thorax(scale_right=SHRUNK).lungs["right"].inside
+    hu = np.where(gap & lung, np.float32(-1000), deflated.volume.hu)
+    parted = PreparedCbct(Volume(hu, deflated.volume.ras_from_ijk), deflated.field, deflated.removed)
+    surface = deflated_surface(find_pneumothorax(parted, prior), deflated.field)
+    fissure = surface.only(Border.FISSURE)
+    flat = np.abs(fissure.normals[:, 2]) > 0.8
+    assert flat.mean() > 0.7
+    assert_allclose(np.abs(fissure.points[flat, 2] + 10.0).mean(), 4.0, atol=1.0)
+
+
+def test_inflated_lung_is_not_called_collapsed(prior: ThoraxPrior) -> None:
+    still = find_pneumothorax(prepare_cbct(known.cone_beam(known.thorax().volume, (50.0, 0.0), 110.0)), prior)
+    assert not still.is_collapsed
+    assert still.air_ml < 20.0
+    assert known.dice(still.lung, known.thorax().lungs["right"]) > 0.85
+
+
+def test_diaphragm_is_the_lower_border_of_the_space(found: Pneumothorax, deflated: PreparedCbct) -> None:
+    dome = diaphragm_points(found.space, found.image, deflated.field)
+    assert len(dome) > 50
+    assert (dome.normals[:, 2] < -0.5).all()
+    y = (dome.points - known.CENTRES["right"]) / known.HALF_AXES
+    f = np.linalg.norm(y, axis=1)
+    assert np.median(np.abs(f * (f - 1) / np.linalg.norm(y / known.HALF_AXES, axis=1))) < 1.0
+
+
+@pytest.mark.parametrize("shift", [(8.0, -4.0, 6.0), (0.0, 0.0, 0.0), (-10.0, 5.0, -7.5)])
+def test_hilum_is_tracked_by_value_and_sign(shift: tuple[float, float, float]) -> None:
+    scene = known.thorax()
+    cbct = prepare_cbct(known.cone_beam(scene.volume, (20.0, 0.0), 120.0))
+    affine = scene.airways.ras_from_ijk.copy()
+    affine[:3, 3] -= shift
+    root = known.CARINA + np.array([25.0, 0.0, -14.0])
+    tracked = track_hilum(cbct, Mask(scene.airways.inside, affine), root - np.array(shift))
+    assert_allclose(tracked.shift_mm, shift, atol=1.6)
+    assert tracked.contrast_hu > 300.0
+    assert tracked.contrast_hu > 1.2 * tracked.runner_up_hu
+
+
+@pytest.mark.shared
+@pytest.mark.parametrize(("name", "air_ml"), [("twin-a", (600, 850)), ("twin-b", (330, 520)), ("twin-c", (330, 520))])
+def test_pleural_air_of_the_twins_is_plausible(shared: Path, name: str, air_ml: tuple[float, float]) -> None:
+    import json
+
+    from vatsloc.case import read_case
+
+    case = read_case(shared / "cases" / name)
+    pose = np.array(json.loads((shared / "cases" / name / "truth" / "info.json").read_text())["T"]["deflated"])
+    back = np.linalg.inv(pose)
+    cbct = prepare_cbct(case.cbct_deflated)
+    lungs = segment_lungs(case.ct, case.side)
+    seen = find_pneumothorax(
+        cbct, carry_prior(lungs, case.side, cbct.volume, lambda p: p @ back[:3, :3].T + back[:3, 3])
+    )
+    assert seen.is_collapsed
+    assert air_ml[0] < seen.air_ml < air_ml[1]
+    dense = np.genfromtxt(shared / "cases" / name / "truth" / "dense_ras_mm.csv", delimiter=",", skip_header=1)
+    ijk = np.rint(seen.air.grid.to_ijk(dense[:, 6:9])).astype(int)
+    within = ((ijk >= 0) & (ijk < seen.air.grid.shape)).all(axis=1)
+    assert seen.air.inside[tuple(ijk[within].T)].mean() < 0.12

@@ -1,0 +1,5 @@
+"""`python -m vatsloc`."""
+
+from vatsloc.cli import main
+
+main()

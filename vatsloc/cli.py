@@ -1,0 +1,122 @@
+"""Command line: data on stdout, talk on stderr, exit codes of the case format."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from vatsloc.errors import CaseError, GateFailed, VatslocError
+
+app = typer.Typer(
+    add_completion=False,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    help="Where is the nodule in the collapsed lung? CT + inflated CBCT + deflated CBCT in, position and report out.",
+)
+
+CaseArgument = Annotated[Path, typer.Argument(metavar="CASE", help="Case folder with case.toml.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout.")]
+
+
+def say(message: str) -> None:
+    """Progress and talk, on stderr."""
+    print(message, file=sys.stderr, flush=True)
+
+
+def show(data: dict[str, Any]) -> None:
+    """Data, on stdout."""
+    print(json.dumps(data, indent=2))
+
+
+@app.command()
+def localize(
+    case: CaseArgument,
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Results folder, written whole or not at all.")],
+    preset: Annotated[str, typer.Option(metavar="NAME", help="fast or balanced.")] = "balanced",
+    settings: Annotated[Path | None, typer.Option(metavar="FILE", help="TOML file that overrides the preset.")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Find the nodule of CASE in the deflated cone-beam CT."""
+    from vatsloc.workflow.run import run_case
+    from vatsloc.workflow.settings import load_settings
+
+    run = run_case(case, out, load_settings(preset, settings), say)
+    if as_json:
+        show(run)
+    else:
+        x, y, z = run["nodule_lps"]
+        print(f"nodule at LPS {x:.1f} {y:.1f} {z:.1f} mm in the deflated CBCT; report: {out / 'report.html'}")
+    failed = [gate["says"] for gate in run["gates"].values() if not gate["ok"]]
+    if failed:
+        raise GateFailed(f"The result is written to {out}, but do not trust it: {' '.join(failed)}")
+
+
+@app.command()
+def evaluate(
+    case: CaseArgument,
+    result: Annotated[Path, typer.Argument(metavar="DIR", help="Results folder of the case.")],
+    as_json: JsonOption = False,
+) -> None:
+    """Score the result in DIR with the landmarks and the true nodule of CASE."""
+    from vatsloc.evaluation import evaluate_case, table
+
+    scores = evaluate_case(case, result)
+    say(table(scores))
+    if as_json:
+        show(scores)
+
+
+@app.command()
+def phantom(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the phantom, for instance demo.")],
+    out: Annotated[Path, typer.Option("--out", metavar="CASE", help="Case folder to write.")],
+    seed: Annotated[int, typer.Option(metavar="N", help="Seed of the anatomy.")] = 0,
+) -> None:
+    """Write a synthetic case with known truth."""
+    from vatsloc.phantom_case import write_phantom
+
+    write_phantom(name, out, seed, say)
+    print(out)
+
+
+@app.command()
+def demo(
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the phantom case and its result.")] = Path(
+        "vatsloc-demo"
+    ),
+) -> None:
+    """Make a phantom, localize its nodule with the fast preset, score it and say where the report is."""
+    from vatsloc.evaluation import evaluate_case, table
+    from vatsloc.phantom_case import write_phantom
+    from vatsloc.workflow.run import run_case
+    from vatsloc.workflow.settings import load_settings
+
+    case, result = out / "case", out / "result"
+    write_phantom("demo", case, 0, say)
+    run = run_case(case, result, load_settings("fast", None), say)
+    scores = evaluate_case(case, result)
+    say(table(scores))
+    failed = [name for name, gate in run["gates"].items() if not gate["ok"]]
+    print(f"report: {(result / 'report.html').resolve()}")
+    if failed:
+        raise GateFailed(f"The demo's quality gates failed: {', '.join(failed)}.")
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run the command line; errors a user can act on become one sentence and an exit code."""
+    try:
+        app(args=arguments, standalone_mode=True)
+    except VatslocError as error:
+        say(f"vatsloc: {error}")
+        sys.exit(error.exit_code)
+    except OSError as error:
+        say(f"vatsloc: {error.strerror or error} ({error.filename}); check the path, its permissions and the free space.")
+        sys.exit(CaseError.exit_code)
+
+
+if __name__ == "__main__":
+    main()

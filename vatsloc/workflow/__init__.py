@@ -1,0 +1,1 @@
+"""The two-phase localization: change of pose, then pneumothorax."""

@@ -1,0 +1,158 @@
+"""Phase 1, change of pose: from the CT to the inflated cone-beam CT. Ref: Alvarez 2021, section 6."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+from poro.extrapolate import Extrapolation, extrapolate
+from poro.mesh import TetMesh, stuff
+from poro.tissue import Tissue
+from registration.ffd import FfdFit, FfdSettings
+from registration.inversion import Inversion, invert_at
+from registration.objective import Weights
+from registration.resample import coarsen_mask
+from registration.rigid import RigidTransform
+from registration.sliding import register_sliding
+from registration.spine import RigidFit, register_spine
+from registration.volume import Array, Mask, Volume
+from vatsloc.case import Case
+from vatsloc.imaging.lungs import Side
+from vatsloc.imaging.thorax import carry_prior, inflated_lung, require_share, visible_share
+from vatsloc.maps import BlendedMap, MeshMap, PointMap
+from vatsloc.workflow.prepare import Prepared
+from vatsloc.workflow.settings import RegistrationSettings, Settings
+from vatsloc.workflow.stages import Stages
+
+RIM_MM = 12.0
+"""Near the rim of what the scanner saw, the registration gives way to the mesh over this width."""
+
+
+@dataclass(frozen=True)
+class ChangeOfPose:
+    """The lung before its collapse. mesh_ct, points_inf: the same nodes in the CT and in the inflated CBCT, mm.
+
+    inversion: of the free-form deformation at the nodes; seen: (n,) nodes that the scanner saw; lung_inf: lung mask in
+    the CBCT; overlap: share of the lung in its field of view.
+    """
+
+    rigid: RigidFit
+    ffd: FfdFit
+    lung_inf: Mask
+    mesh_ct: TetMesh
+    points_inf: Array
+    seen: Array
+    inversion: Inversion
+    extrapolation: Extrapolation
+    overlap: float
+    inf_from_ct: PointMap
+    ct_from_inf: PointMap
+
+    @property
+    def inf_from_ct_rigid(self) -> RigidTransform:
+        """Rigid part, CT to inflated CBCT."""
+        return self.rigid.moving_from_fixed.inverse()
+
+    @property
+    def mesh_inf(self) -> TetMesh:
+        """The lung's mesh in the inflated CBCT."""
+        return TetMesh(self.points_inf, self.mesh_ct.tets)
+
+
+def change_of_pose(case: Case, prepared: Prepared, settings: Settings, stages: Stages) -> ChangeOfPose:
+    """Register the CT to the inflated CBCT and continue the motion to the whole lung."""
+    with stages.stage("spine CT to inflated"):
+        rigid = register_spine(
+            prepared.inflated.volume,
+            case.ct,
+            prepared.spine_inflated.mask,
+            prepared.spine_ct.mask,
+            initial=_hinted(case),
+        )
+    ct_from_inf_rigid, inf_from_ct_rigid = rigid.moving_from_fixed, rigid.moving_from_fixed.inverse()
+    overlap = visible_share(prepared.lung_ct, prepared.inflated.field, inf_from_ct_rigid)
+    require_share(overlap, as_side(case.side), settings.gates.min_overlap)
+    with stages.stage("inflated lung"):
+        prior = carry_prior(prepared.lungs, as_side(case.side), prepared.inflated.volume, ct_from_inf_rigid)
+        lung_inf = inflated_lung(prepared.inflated, prior)
+    with stages.stage("free-form deformation"):
+        ffd = register_sliding(
+            prepared.inflated.volume,
+            case.ct,
+            prepared.lung_ct,
+            ffd_settings(settings.registration),
+            fixed_lung=lung_inf,
+            seen=prepared.inflated.field.usable,
+            prior=ct_from_inf_rigid,
+            progress=lambda what, _share: stages.say(what),
+        )
+    with stages.stage("mesh"):
+        mesh = stuff(prepared.lung_ct.inside, prepared.lung_ct.ras_from_ijk, settings.mesh.edge_mm)
+    with stages.stage("inversion and extrapolation"):
+        placed = inf_from_ct_rigid(mesh.points)
+        inversion = invert_at(ffd.moving_from_fixed, mesh.points, placed)
+        trust = _Trust(prepared.inflated.field.usable)
+        seen = (trust(inversion.points_fixed) > 0) & (inversion.residual_mm < settings.gates.max_inversion_mm)
+        nodes = np.flatnonzero(seen)
+        rigid_mesh = TetMesh(placed, mesh.tets)
+        extension = extrapolate(rigid_mesh, nodes, (inversion.points_fixed - placed)[nodes], Tissue())
+    points_inf = placed + extension.u
+    by_mesh = MeshMap(mesh, points_inf, inf_from_ct_rigid)
+
+    def inverted(points_ct: Array) -> Array:
+        return invert_at(ffd.moving_from_fixed, points_ct, by_mesh(points_ct)).points_fixed
+
+    return ChangeOfPose(
+        rigid=rigid,
+        ffd=ffd,
+        lung_inf=lung_inf,
+        mesh_ct=mesh,
+        points_inf=points_inf,
+        seen=seen,
+        inversion=inversion,
+        extrapolation=extension,
+        overlap=overlap,
+        inf_from_ct=BlendedMap(inverted, by_mesh, lambda x: trust(by_mesh(x))),
+        ct_from_inf=BlendedMap(ffd.moving_from_fixed, by_mesh.inverse(), trust),
+    )
+
+
+def ffd_settings(settings: RegistrationSettings) -> FfdSettings:
+    """The registration's own settings, from those of a run."""
+    return FfdSettings(
+        spacing_mm=settings.grid_mm,
+        levels=settings.levels,
+        voxel_mm=settings.voxel_mm,
+        window_mm=settings.window_mm,
+        weights=Weights(bending=settings.bending),
+    )
+
+
+def as_side(side: str) -> Side:
+    """"left" or "right", for the type checker too."""
+    return "left" if side == "left" else "right"
+
+
+def _hinted(case: Case) -> RigidTransform | None:
+    """Start of the spine search from the same vertebra marked in both images; None without hints."""
+    ct, inflated = case.hints.spine_ct_ras, case.hints.spine_cbct_inflated_ras
+    if ct is None or inflated is None:
+        return None
+    return RigidTransform.about(inflated, np.zeros(3), ct - inflated)
+
+
+class _Trust:
+    """Weight of the registration at a point (n, 3): 0 at the rim of what was seen, 1 from RIM_MM inwards."""
+
+    def __init__(self, usable: Mask) -> None:
+        coarse = coarsen_mask(usable, 4.0)
+        inside = np.pad(coarse.hu >= 0.5, 1)
+        depth = ndimage.distance_transform_edt(inside, sampling=coarse.grid.spacing)[1:-1, 1:-1, 1:-1]
+        self._depth = Volume(depth.astype(np.float32), coarse.ras_from_ijk)
+
+    def __call__(self, points_ras: Array) -> Array:
+        ijk = self._depth.grid.to_ijk(points_ras).T
+        depth = ndimage.map_coordinates(self._depth.hu, ijk, order=1, mode="constant", cval=0.0)
+        return np.clip(depth / RIM_MM, 0.0, 1.0)

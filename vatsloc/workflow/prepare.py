@@ -1,0 +1,40 @@
+"""What is read off each image before anything is registered: lungs, airways, spines and fields of view."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from registration.volume import Mask
+from vatsloc.case import Case
+from vatsloc.imaging.cbct import PreparedCbct, prepare_cbct
+from vatsloc.imaging.lungs import Lungs, segment_lungs
+from vatsloc.imaging.spine import Spine, segment_spine
+from vatsloc.workflow.stages import Stages
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """Images fit for registration. lung_ct: the operated lung on the CT's grid."""
+
+    lungs: Lungs
+    lung_ct: Mask
+    inflated: PreparedCbct
+    deflated: PreparedCbct
+    spine_ct: Spine
+    spine_inflated: Spine
+    spine_deflated: Spine
+
+
+def prepare(case: Case, stages: Stages) -> Prepared:
+    """Segment the CT and clean the cone-beam images. Raises InputRefused when one does not show what it should."""
+    with stages.stage("CT lungs"):
+        lungs = segment_lungs(case.ct, case.side, case.nodule.mask, case.nodule.centre_ras)
+        if case.hints.lung_mask_ct is not None:
+            lungs = replace(lungs, **{case.side: case.hints.lung_mask_ct})
+    with stages.stage("CBCT preparation"):
+        inflated, deflated = prepare_cbct(case.cbct_inflated), prepare_cbct(case.cbct_deflated)
+    with stages.stage("spines"):
+        spine_ct = segment_spine(case.ct)
+        spine_inflated = segment_spine(inflated.volume, inflated.field.usable)
+        spine_deflated = segment_spine(deflated.volume, deflated.field.usable)
+    return Prepared(lungs, lungs.of(case.side), inflated, deflated, spine_ct, spine_inflated, spine_deflated)

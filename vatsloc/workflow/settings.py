@@ -1,0 +1,99 @@
+"""Settings of a run: presets, and a TOML file that overrides single values."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from vatsloc.errors import CaseError
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class RegistrationSettings(_Table):
+    """Free-form deformation of phase 1. Lengths in mm; bending: weight of the bending energy, mm2."""
+
+    grid_mm: float = Field(16.0, ge=4, le=64)
+    levels: int = Field(4, ge=1, le=6)
+    voxel_mm: float = Field(2.0, ge=0.5, le=8)
+    window_mm: float | None = Field(14.0, gt=0)
+    bending: float = Field(100.0, gt=0)
+
+
+class MeshSettings(_Table):
+    """Finite-element lung. edge_mm: spacing of its tetrahedra."""
+
+    edge_mm: float = Field(8.0, ge=3, le=25)
+
+
+class ModelSettings(_Table):
+    """Phase 2. cost: "plain" is the paper's; pose, hilum, diaphragm: the paper's variants leave one out."""
+
+    cost: Literal["surface", "plain"] = "surface"
+    pose: bool = True
+    hilum: bool = True
+    diaphragm: bool = True
+    hilum_radius_mm: float = Field(15.0, gt=0)
+    max_steps: int = Field(30, ge=1)
+
+
+class GateSettings(_Table):
+    """Limits beyond which a result is marked as not to be trusted."""
+
+    min_overlap: float = Field(0.40, ge=0, le=1)
+    min_spine_ncc: float = 0.5
+    min_spine_margin: float = 0.02
+    max_folded_share: float = 0.0
+    max_inversion_mm: float = 1.0
+    max_inverted_elements: float = 0.01
+    max_surface_rms_mm: float = 6.0
+    min_surface_points: int = 200
+
+
+class Settings(_Table):
+    """Everything that shapes a result besides its inputs."""
+
+    seed: int = 0
+    registration: RegistrationSettings = RegistrationSettings()
+    mesh: MeshSettings = MeshSettings()
+    model: ModelSettings = ModelSettings()
+    gates: GateSettings = GateSettings()
+
+
+PRESETS: dict[str, dict[str, Any]] = {
+    "fast": {"registration": {"grid_mm": 20.0, "levels": 3, "voxel_mm": 3.0}, "mesh": {"edge_mm": 11.0}},
+    "balanced": {},
+}
+
+
+def load_settings(preset: str, file: Path | None) -> Settings:
+    """Values of a preset, overridden by those of a TOML file. Raises CaseError for unknown names and wrong values."""
+    if preset not in PRESETS:
+        raise CaseError(f'"{preset}" is no preset; choose one of {", ".join(PRESETS)}.')
+    values = PRESETS[preset]
+    if file is not None:
+        try:
+            values = _merged(values, tomllib.loads(file.read_text(encoding="utf-8")))
+        except (FileNotFoundError, IsADirectoryError) as error:
+            raise CaseError(f"{file} is not there; give a TOML file of settings.") from error
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            raise CaseError(f"{file} is not valid TOML ({error}); correct it.") from error
+    try:
+        return Settings(**values)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise CaseError(f"{file}: {where}: {first['msg']}; correct it.") from error
+
+
+def _merged(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
+    out = dict(base)
+    for key, value in over.items():
+        known = out.get(key)
+        out[key] = _merged(known, value) if isinstance(known, dict) and isinstance(value, dict) else value
+    return out

@@ -1,0 +1,73 @@
+"""Bookkeeping of a run: which stage is at work, how long each took, what memory peaked at."""
+
+from __future__ import annotations
+
+import resource
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+Say = Callable[[str], None]
+
+
+def quiet(_message: str) -> None:
+    """Progress callback for callers who want silence."""
+
+
+@dataclass
+class Stages:
+    """Log of a run. seconds and peak_mb: by stage name, in the order they ran; skipped: stage -> why."""
+
+    say: Say = quiet
+    seconds: dict[str, float] = field(default_factory=dict)
+    peak_mb: dict[str, float] = field(default_factory=dict)
+    skipped: dict[str, str] = field(default_factory=dict)
+    warnings: list[str] = field(default_factory=list)
+    _start: float = field(default_factory=time.perf_counter)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Time a block as the stage `name` and note the highest memory while it ran."""
+        self.say(f"{name} ...")
+        reset = _reset_peak()
+        start = time.perf_counter()
+        yield
+        self.seconds[name] = round(time.perf_counter() - start, 3)
+        self.peak_mb[name] = round(_peak_mb(reset), 1)
+        self.say(f"{name}: {self.seconds[name]:.1f} s")
+
+    def skip(self, name: str, why: str) -> None:
+        """Note that the stage `name` was left out."""
+        self.skipped[name] = why
+        self.say(f"{name}: skipped, {why}")
+
+    def warn(self, sentence: str) -> None:
+        """Note something the reader of the result has to know."""
+        self.warnings.append(sentence)
+        self.say(f"warning: {sentence}")
+
+    @property
+    def total_seconds(self) -> float:
+        """Seconds since the log was opened."""
+        return round(time.perf_counter() - self._start, 3)
+
+
+def _reset_peak() -> bool:
+    """Ask Linux to forget the process's memory peak, so that each stage shows its own; False where that is refused."""
+    try:
+        Path("/proc/self/clear_refs").write_text("5")
+    except OSError:
+        return False
+    return True
+
+
+def _peak_mb(was_reset: bool) -> float:
+    if was_reset:
+        for line in Path("/proc/self/status").read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return float(line.split()[1]) / 1024
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (1024**2 if sys.platform == "darwin" else 1024)
