@@ -21,7 +21,9 @@ def _scatter(mesh: TetMesh, local: Array, rows: int, columns: int) -> csr_matrix
 
 
 def stiffness(mesh: TetMesh, lame: float | Array, shear: float | Array) -> csr_matrix:
-    """Linear elasticity: integral of (lambda tr(eps) I + 2 mu eps) : eps(v), (3n, 3n) kPa mm; moduli scalar or (m,) kPa."""
+    """Linear elasticity: integral of (lambda tr(eps) I + 2 mu eps) : eps(v), (3n, 3n) kPa mm; moduli scalar or (m,)
+    kPa.
+    """
     g = mesh.gradients
     volume = mesh.volumes
     outer = np.einsum("mai,mbj->maibj", g, g)

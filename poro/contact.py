@@ -17,7 +17,7 @@ from poro.levelset import LevelSet
 from poro.mesh.tetmesh import Array
 
 GAP_TOLERANCE_MM = 1e-9
-SPRING_CUT = 1e-6
+SPRING_CUT = 0.02  # springs softer than this share of the stiffest wait for the next linearization
 MAX_MOVE_MM = 20.0  # largest step over which a linearized wall is believed
 
 
@@ -118,13 +118,12 @@ class Springs:
     inverse: Array
 
 
-def curvature_springs(compliance: Compliance, force: Array, hessian: Array) -> Springs:
+def curvature_springs(compliance: Compliance, force: Array, hessian: Array, cut: float = SPRING_CUT) -> Springs:
     """Springs of forces (nc,) on a wall of Hessian (nc, 3, 3): a hollow wall steadies the nodes that press on it."""
     nodes = np.flatnonzero(force)
     values, vectors = np.linalg.eigh(-force[nodes, None, None] * hessian[nodes])
     flat = values.ravel()
-    # Springs far softer than the tissue change nothing but the size of the dense system.
-    keep = np.abs(flat) > SPRING_CUT * np.abs(flat).max(initial=0)
+    keep = np.abs(flat) > cut * np.abs(flat).max(initial=0)
     rows, along, strength = np.repeat(nodes, 3)[keep], vectors.transpose(0, 2, 1).reshape(-1, 3)[keep], flat[keep]
     matrix = compliance.between(rows, along, rows, along) + np.diag(1 / strength)
     return Springs(rows, along, strength, inv(matrix) if len(rows) else matrix)
@@ -132,7 +131,9 @@ def curvature_springs(compliance: Compliance, force: Array, hessian: Array) -> S
 
 @dataclass(frozen=True)
 class Linearized:
-    """Wall seen from displacements u (nc, 3): gap (nc,), gradient (nc, 3), curvature springs; free: (nc, 3) without wall."""
+    """Wall seen from displacements u (nc, 3): gap (nc,), gradient (nc, 3), curvature springs; free: (nc, 3) without
+    wall.
+    """
 
     compliance: Compliance
     gap: Array
@@ -148,7 +149,9 @@ class Linearized:
         return self.springs.inverse @ pull
 
     def reduced(self, pool: Array) -> tuple[Array, Array, Array]:
-        """Compliance (k, k) and gap (k,) of nodes `pool` with the springs eliminated, and how they load the springs (r, k)."""
+        """Compliance (k, k) and gap (k,) of nodes `pool` with the springs eliminated, and how they load the springs
+        (r, k).
+        """
         n, s = self.gradient[pool], self.springs
         coupling = self.compliance.between(s.rows, s.along, pool, n)
         matrix = self.compliance.between(pool, n, pool, n) - coupling.T @ (s.inverse @ coupling)
@@ -167,13 +170,11 @@ class Linearized:
         return self.free + self.compliance.apply(total)
 
 
-def complementarity(
-    wall: Linearized, active: Array, max_pivots: int = 400
-) -> tuple[Array, Array, Array, int, bool]:
+def complementarity(wall: Linearized, active: Array, max_pivots: int = 400) -> tuple[Array, Array, Array, int, bool]:
     """Forces (nc,) >= 0 with linearized gap >= 0 and gap . force = 0, from a guessed active set (nc,) bool.
 
-    Returns forces, active set, displacements (nc, 3), pivots, and whether the set cycled, after which one node at a time
-    is exchanged. Raises RuntimeError when even that does not settle.
+    Returns forces, active set, displacements (nc, 3), pivots, and whether the set cycled, after which one node at a
+    time is exchanged. Raises RuntimeError when even that does not settle.
     """
     seen: set[bytes] = set()
     single = False
@@ -210,11 +211,11 @@ def contact_sensitivity(
 ) -> Array:
     """Derivatives of the contact forces, (nc, 3, k), at a fixed active set.
 
-    free: (nc, 3, k) derivatives of the displacements without wall; travel: (k,) derivatives of the wall's travel. The wall's
-    curvature turns the forces as the nodes slide; normal and turning forces come from one symmetric system.
+    free: (nc, 3, k) derivatives of the displacements without wall; travel: (k,) derivatives of the wall's travel. The
+    wall's curvature turns the forces as the nodes slide; normal and turning forces come from one symmetric system.
     """
     active = np.flatnonzero(state.active)
-    springs = curvature_springs(compliance, np.where(state.active, state.force, 0), state.hessian)
+    springs = curvature_springs(compliance, np.where(state.active, state.force, 0), state.hessian, 1e-6)
     rows = np.concatenate([active, springs.rows])
     direction = np.concatenate([state.gradient[active], springs.along])
     result = np.zeros_like(free)

@@ -35,7 +35,9 @@ class Tree:
 
 
 def dissect(graph: csr_matrix, points: Array, leaf: int = 48) -> Tree:
-    """Elimination tree of a symmetric node graph (n, n) over points (n, 3), cut across the longest side again and again."""
+    """Elimination tree of a symmetric node graph (n, n) over points (n, 3), cut across the longest side again and
+    again.
+    """
     pieces: list[Array] = []
     below: list[tuple[int, ...]] = []
     side = np.zeros(len(points), np.int64)

@@ -29,7 +29,9 @@ class ExtrapolationStatus(Enum):
 
 @dataclass(frozen=True)
 class Extrapolation:
-    """Displacement of the whole mesh. u: (n, 3) mm; det_f: (m,); released: node numbers whose imposed value was dropped."""
+    """Displacement of the whole mesh. u: (n, 3) mm; det_f: (m,); released: node numbers whose imposed value was
+    dropped.
+    """
 
     u: Array
     det_f: Array
@@ -49,8 +51,9 @@ def extrapolate(
 ) -> Extrapolation:
     """Continue displacements (k, 3) mm of `nodes` (k,) elastically to the whole mesh.
 
-    weights: (k,) squared ratio of node spacing to the length over which a single value may be smoothed; exact when None. Values
-    that turn an element below `min_det` are released, round by round. Raises ValueError for fewer than three nodes.
+    weights: (k,) squared ratio of node spacing to the length over which a single value may be smoothed; exact when
+    None. Values that turn an element below `min_det` are released, round by round. Raises ValueError for fewer than
+    three nodes.
     """
     nodes = np.asarray(nodes)
     if len(np.unique(nodes)) < 3 or displacement_mm.shape != (len(nodes), 3):
@@ -58,13 +61,15 @@ def extrapolate(
             f"need displacements (k, 3) at three or more nodes, got {displacement_mm.shape} at {len(nodes)}"
         )
     kept = np.ones(len(nodes), bool)
-    for rounds in range(1, max_rounds + 1):
+    rounds = 0
+    while True:
+        rounds += 1
         part = None if weights is None else weights[kept]
         u = _continue(mesh, nodes[kept], displacement_mm[kept], tissue, part)
         det_f = np.linalg.det(deformation_gradient(mesh, u))
         bad = np.unique(mesh.tets[det_f < min_det])
         release = kept & np.isin(nodes, bad)
-        if not release.any() or (kept & ~release).sum() < 3:
+        if rounds == max_rounds or not release.any() or (kept & ~release).sum() < 3:
             break
         kept &= ~release
     status = ExtrapolationStatus.SOLVED if kept.all() else ExtrapolationStatus.RELEASED
@@ -101,7 +106,9 @@ class Pull:
 
 @dataclass(frozen=True)
 class Correction:
-    """Elastic displacement on top of a solved state. u: (n, 3) mm; det_f: (m,) of the correction alone; misfit_mm: (q,)."""
+    """Elastic displacement on top of a solved state. u: (n, 3) mm; det_f: (m,) of the correction alone; misfit_mm:
+    (q,).
+    """
 
     u: Array
     det_f: Array
@@ -112,17 +119,20 @@ class Correction:
 def correct(
     mesh: TetMesh, u: Array, tissue: Tissue, pull: Pull, model_sigma: float = 0.05, robust: float = 3.0, rounds: int = 4
 ) -> Correction:
-    """Least elastic energy that brings a solved state (n, 3) nearer to matched points, outliers losing influence (Cauchy).
+    """Least elastic energy that brings a solved state (n, 3) nearer to matched points, outliers losing influence
+    (Cauchy).
 
-    model_sigma: strain the solved state may be wrong by over one tenth of a litre; it sets how stiff the tissue is against
-    millimetres of misfit. The elasticity starts from the deformed shape, so the correction is small even where u is large.
+    model_sigma: strain the solved state may be wrong by over one tenth of a litre; it sets how stiff the tissue is
+    against millimetres of misfit. The elasticity starts from the deformed shape, so the correction is small even
+    where u is large.
     """
     deformed = TetMesh(mesh.points + u, mesh.tets)
     where = locate(deformed, pull.points)
     operator = point_operator(where, len(u))
     axial = np.linalg.norm(pull.normals, axis=1) > 0.5
     shape = np.where(axial[:, None, None], pull.normals[:, :, None] * pull.normals[:, None, :], np.eye(3))
-    # Energy per unit variance: a 0.1 l region strained by model_sigma weighs as much as one standard deviation of misfit.
+    # Energy per unit variance: a 0.1 l region strained by model_sigma weighs as much as one standard deviation of
+    # misfit.
     unit = tissue.young_kpa * 1e5 * model_sigma**2
     influence = where.inside / (1 + np.minimum(where.distance, 1e3))
     field = np.zeros_like(u)

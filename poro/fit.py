@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from poro.mesh.locate import interpolate, locate
 from poro.mesh.tetmesh import Array
@@ -30,9 +31,10 @@ CHI2_95_3D = 7.814728  # 95 % quantile of chi-squared with three degrees of free
 class FitSettings:
     """How a fit weighs its data and when it stops.
 
-    surface_sigma_mm, keypoint_sigma_mm: standard deviations of one observation; correlation_mm: surface points closer than this
-    count as one; robust: residual, in standard deviations, from which influence falls off (Cauchy), infinite for none;
-    plain: the paper's nearest-node cost; free: which entries of theta and the modes may move, all when None.
+    surface_sigma_mm, keypoint_sigma_mm: standard deviations of one observation; correlation_mm: surface points closer
+    than this count as one; robust: residual, in standard deviations, from which influence falls off (Cauchy),
+    infinite for none; plain: the paper's nearest-node cost; free: which entries of theta and the modes may move, all
+    when None.
     """
 
     surface_sigma_mm: float = 2.0
@@ -175,7 +177,8 @@ def fit(
 
 
 def ellipsoid95(result: Fit, system: PoroSystem, point: Array) -> tuple[Array, Array]:
-    """Half axes (3,) mm, longest first, and directions (3, 3) in columns, that hold an inflated point's image with 95 %.
+    """Half axes (3,) mm, longest first, and directions (3, 3) in columns, that hold an inflated point's image with 95
+    %.
 
     The parameters' covariance carried to the point, plus what the fit leaves unexplained at the points it sees.
     """
@@ -256,9 +259,9 @@ def _bounded_step(
 
 
 def _independence(target: Target, correlation_mm: float) -> Array:
-    """Share (t + k,) of an independent observation that every point is worth, by its neighbours within the correlation length."""
-    from scipy.spatial import cKDTree
-
+    """Share (t + k,) of an independent observation that every point is worth, by its neighbours within the
+    correlation length.
+    """
     points = target.points
     crowd = np.ones(len(points))
     if len(points) and correlation_mm > 0:
@@ -268,7 +271,9 @@ def _independence(target: Target, correlation_mm: float) -> Array:
 
 
 def _covariance(problem: _Problem, rows: Residuals, du: Array, theta: Array) -> Array:
-    """Gauss-Newton covariance, widened by the misfit where the model explains less than the data's own noise would leave."""
+    """Gauss-Newton covariance, widened by the misfit where the model explains less than the data's own noise would
+    leave.
+    """
     whitening = problem.whiten(rows)
     normal, _ = _normal_equations(problem, rows, whitening, du, theta)
     weight = whitening**2 * problem.influence(rows)

@@ -18,7 +18,8 @@ from poro.tissue import Tissue
 class Flow:
     """Pressure problem of one mesh and tissue, pleural pressure on the whole surface.
 
-    lumped: whether the reaction is lumped, which keeps the pressure in its physical range whatever the layer's thickness.
+    lumped: whether the reaction is lumped, which keeps the pressure in its physical range whatever the layer's
+    thickness.
     """
 
     mesh: TetMesh

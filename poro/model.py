@@ -56,7 +56,8 @@ class PoroState:
     """One deflated lung.
 
     u: (n, 3) mm; p: (n,) kPa; contact_pressure: (n,) kPa; det_f: (m,); gap: (n,) mm, infinite off the contact nodes;
-    active: (n,) bool; iterations: outer contact steps; conflicts: contact nodes that the diaphragm has pushed behind the cage.
+    active: (n,) bool; iterations: outer contact steps; conflicts: contact nodes that the diaphragm has pushed behind
+    the cage.
     """
 
     theta: Theta
@@ -132,8 +133,9 @@ def assemble(
 ) -> PoroSystem:
     """Set a lung up once: factorize, build the cage from its own surface, find the diaphragm.
 
-    gravity: (3,) unit vector RAS; hilum: (k,) nodes whose displacements (k, 3) mm are imposed; smooth_mm: radius over which the
-    cage is rounded, by default one edge. Raises ValueError when gravity is not a unit vector or fewer than three nodes hold.
+    gravity: (3,) unit vector RAS; hilum: (k,) nodes whose displacements (k, 3) mm are imposed; smooth_mm: radius over
+    which the cage is rounded, by default one edge. Raises ValueError when gravity is not a unit vector or fewer than
+    three nodes hold.
     """
     gravity = np.asarray(gravity, float)
     if abs(np.linalg.norm(gravity) - 1) > 1e-3:

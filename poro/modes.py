@@ -1,4 +1,6 @@
-"""Loads beyond the paper's: smooth fields of shrinkage and small motions of the hilum, each a column of one linear system."""
+"""Loads beyond the paper's: smooth fields of shrinkage and small motions of the hilum, each a column of one linear
+system.
+"""
 
 from __future__ import annotations
 

@@ -64,7 +64,9 @@ class Residuals:
 
 @dataclass(frozen=True)
 class Observer:
-    """Compares deformed meshes with a target. plain: nearest-node distances of the paper instead of distance to the surface."""
+    """Compares deformed meshes with a target. plain: nearest-node distances of the paper instead of distance to the
+    surface.
+    """
 
     mesh: TetMesh
     target: Target
@@ -98,7 +100,8 @@ class Observer:
     def _distances(self, u: Array) -> Residuals:
         """Signed distance of every target point to the deformed surface, exact and so with an exact derivative.
 
-        Where the target's normal and the surface's disagree the point is taken to belong to another side and loses weight.
+        Where the target's normal and the surface's disagree the point is taken to belong to another side and loses
+        weight.
         """
         boundary = self.mesh.boundary
         moved = boundary.moved(boundary.points + u[boundary.nodes])

@@ -1,4 +1,6 @@
-"""One linear solver for elasticity and flow: dense-front Cholesky, or smoothed aggregation when the factor is too large."""
+"""One linear solver for elasticity and flow: dense-front Cholesky, or smoothed aggregation when the factor is too
+large.
+"""
 
 from __future__ import annotations
 

@@ -20,7 +20,8 @@ def point_operator(location: Location, nodes: int) -> csr_matrix:
 def springs(operator: csr_matrix, stiffness: Array, pull: Array) -> tuple[csr_matrix, Array]:
     """Stiffness (3n, 3n) and nodal forces (n, 3) of springs at interpolated points.
 
-    operator: (q, n); stiffness: (q,) kPa mm in all directions, or (q, 3, 3); pull: (q, 3) mm where the springs want the points.
+    operator: (q, n); stiffness: (q,) kPa mm in all directions, or (q, 3, 3); pull: (q, 3) mm where the springs want
+    the points.
     """
     q, n = operator.shape
     if stiffness.ndim == 1:

@@ -9,7 +9,9 @@ GRAVITY_KPA_PER_MM = 9.81e-6  # weight of 1 kg/m3: 9.81 Pa/m
 
 @dataclass(frozen=True)
 class Tissue:
-    """Poroelastic tissue: moduli in kPa, densities in kg/m3, permeability in m2, viscosity in Pa s, pressures in kPa."""
+    """Poroelastic tissue: moduli in kPa, densities in kg/m3, permeability in m2, viscosity in Pa s, pressures in
+    kPa.
+    """
 
     young_kpa: float = 0.55
     poisson: float = 0.35

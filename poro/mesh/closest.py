@@ -13,7 +13,9 @@ from poro.mesh.tetmesh import Array, TriSurface
 
 @dataclass(frozen=True)
 class ClosestPoints:
-    """Nearest surface points. points: (q, 3) mm; triangle: (q,); barycentric: (q, 3); distance: (q,) mm, positive outside."""
+    """Nearest surface points. points: (q, 3) mm; triangle: (q,); barycentric: (q, 3); distance: (q,) mm, positive
+    outside.
+    """
 
     points: Array
     triangle: Array
@@ -22,7 +24,9 @@ class ClosestPoints:
 
 
 def closest_points(surface: TriSurface, queries: Array) -> ClosestPoints:
-    """Nearest point of a surface to every query (q, 3) mm; the sign comes from normals interpolated over the triangle."""
+    """Nearest point of a surface to every query (q, 3) mm; the sign comes from normals interpolated over the
+    triangle.
+    """
     queries = np.ascontiguousarray(queries, float)
     x = surface.points[surface.triangles]
     centres = x.mean(axis=1)

@@ -16,7 +16,7 @@ class Location:
     """Where points lie in a mesh.
 
     nodes: (q, 4) corners of the tetrahedron; barycentric: (q, 4); inside: (q,) bool; distance: (q,) mm, 0 inside.
-    Points outside carry the weights of the nearest point of the surface.
+    Points outside carry the weights of the nearest point of the surface, or none at an infinite distance.
     """
 
     nodes: Array
@@ -25,8 +25,11 @@ class Location:
     distance: Array
 
 
-def locate(mesh: TetMesh, points: Array) -> Location:
-    """Tetrahedron and barycentric coordinates of points (q, 3) mm; outside, those of the nearest surface point."""
+def locate(mesh: TetMesh, points: Array, nearest: bool = True) -> Location:
+    """Tetrahedron and barycentric coordinates of points (q, 3) mm.
+
+    Points outside get those of the nearest surface point, or zeros where `nearest` is False, which is far cheaper.
+    """
     points = np.ascontiguousarray(points, float)
     if points.ndim != 2 or points.shape[1] != 3:
         raise ValueError(f"points must be (q, 3), got {points.shape}")
@@ -42,7 +45,9 @@ def locate(mesh: TetMesh, points: Array) -> Location:
     nodes = mesh.tets[np.maximum(tet, 0)]
     distance = np.zeros(len(points))
     lost = np.flatnonzero(tet < 0)
-    if len(lost):
+    if not nearest:
+        bary[lost], distance[lost] = 0.0, np.inf
+    elif len(lost):
         surface = mesh.boundary
         near = closest_points(surface, points[lost])
         nodes[lost, :3] = surface.nodes[surface.triangles[near.triangle]]

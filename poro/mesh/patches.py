@@ -26,14 +26,17 @@ class Patches:
 
 
 def principal_axis(mesh: TetMesh) -> Array:
-    """First principal axis of the lung's volume, unit vector (3,) that points to the head. Ref: Alvarez 2021, sec. 7.2.3."""
+    """First principal axis of the lung's volume, unit vector (3,) that points to the head. Ref: Alvarez 2021, sec.
+    7.2.3.
+    """
     centred = mesh.points - np.average(mesh.points, axis=0, weights=mesh.node_volumes)
     axis = np.linalg.eigh(centred.T @ (centred * mesh.node_volumes[:, None]))[1][:, -1]
     return axis if axis[2] >= 0 else -axis
 
 
 def patches(surface: TriSurface, hilum_points: Array, hilum_radius_mm: float = 12.0) -> Patches:
-    """Diaphragm (largest inferior-facing piece), hilum (near given points (k, 3)), mediastinal (facing the hilum), costal.
+    """Diaphragm (largest inferior-facing piece), hilum (near given points (k, 3)), mediastinal (facing the hilum),
+    costal.
 
     Raises ValueError when no surface node looks down.
     """
