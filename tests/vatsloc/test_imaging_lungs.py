@@ -10,6 +10,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from registration.volume import Mask, Volume
+from vatsloc.case import read_case
 from vatsloc.errors import InputRefused
 from vatsloc.imaging.hilum import find_hilum
 from vatsloc.imaging.lungs import segment_lungs
@@ -106,11 +107,8 @@ def test_ct_without_the_operated_lung_is_refused() -> None:
 
 
 @pytest.mark.shared
-@pytest.mark.parametrize(("name", "litres"), [("twin-a", (2.4, 2.8)), ("twin-b", (1.6, 1.9))])
-def test_lungs_of_a_real_ct_are_plausible(shared: Path, name: str, litres: tuple[float, float]) -> None:
-    from vatsloc.case import read_case
-
-    case = read_case(shared / "cases" / name)
+def test_lungs_of_a_real_ct_are_plausible(shared: Path) -> None:
+    case = read_case(shared / "cases" / "twin-a")
     lungs = segment_lungs(case.ct, case.side)
-    assert litres[0] < lungs.volume_ml[case.side] / 1000 < litres[1]
+    assert 2.4 < lungs.volume_ml["right"] / 1000 < 2.8
     assert 10.0 < lungs.airways.inside.sum() * lungs.airways.grid.spacing.prod() / 1000 < 80.0

@@ -115,8 +115,8 @@ def track_airways(work: Volume, seen: Array, expected: Array, reach_mm: float = 
     away = np.linalg.norm((steps - first) * spacing, axis=1) >= 8.0
     near = first + np.stack(np.meshgrid(*[np.arange(-2, 3)] * 3, indexing="ij"), -1).reshape(-1, 3)
     fine = _contrasts(hu, lumen_ijk, wall_ijk, near).reshape(5, 5, 5)
-    peak = np.unravel_index(int(fine.argmax()), fine.shape)
-    best = first + np.array(peak) - 2
+    peak = np.array(np.unravel_index(int(fine.argmax()), fine.shape))
+    best = first + peak - 2
     moved = _shifted(expected, best) & seen
     region = dilate(moved, 5.0, spacing)
     dark_level = float(np.median(work.hu[moved])) + 150.0 if moved.any() else -1000.0
@@ -152,13 +152,14 @@ def _shifted(inside: Array, step: Array) -> Array:
     return out
 
 
-def _between_voxels(score: Array, peak: tuple[int, ...]) -> Array:
+def _between_voxels(score: Array, peak: Array) -> Array:
     """Offset (3,) in voxels from the best sample to the top of the parabola through its neighbours on each axis."""
     offset = np.zeros(3)
     for axis in range(3):
-        line = np.moveaxis(score, axis, 0)[(slice(None), *[p for m, p in enumerate(peak) if m != axis])]
-        p = peak[axis]
-        if 0 < p < len(line) - 1 and np.isfinite(line[p - 1 : p + 2]).all():
-            bend = line[p - 1] - 2 * line[p] + line[p + 1]
-            offset[axis] = 0.5 * (line[p - 1] - line[p + 1]) / bend if bend < 0 else 0.0
+        if not 0 < peak[axis] < score.shape[axis] - 1:
+            continue
+        before, at, after = (float(score[tuple(peak + step * np.eye(3, dtype=int)[axis])]) for step in (-1, 0, 1))
+        bend = before - 2 * at + after
+        if np.isfinite(bend) and bend < 0:
+            offset[axis] = 0.5 * (before - after) / bend
     return np.clip(offset, -0.5, 0.5)

@@ -139,7 +139,7 @@ def _membership(mask: Mask, points: Array) -> Array:
 
 
 def _over_hidden_air(found: Pneumothorax, points: Array, normals: Array) -> Array:
-    """Whether the last 6 mm of "lung" are so much darker than what lies deeper that a blurred film of air is likelier."""
+    """Whether the outer 6 mm are so much darker than what lies deeper that they are likelier a blurred film of air."""
     skin = np.median(_along(found.image, points, normals, (-2.0, -3.0, -4.5, -6.0)), axis=1)
     deep = np.median(_along(found.image, points, normals, (-11.0, -13.0, -15.0, -17.0)), axis=1)
     return (skin < deep - 0.25 * found.contrast_hu) & (skin < found.limit_hu + 0.5 * found.contrast_hu)
