@@ -115,7 +115,10 @@ def _ct(thorax: Thorax, lung: Lattice, spec: PhantomSpec, rng: np.random.Generat
     other = "left" if spec.side == "right" else "right"
     body = image_body(thorax, grid, (other,))
     distance = thorax.shapes.lung(spec.side).on(grid)
-    hu = body + coverage(distance, width) * (thorax.parenchyma.on(grid) - body)
+    tissue = thorax.parenchyma.on(grid)
+    inside = distance < width
+    tissue[inside] += thorax.fissure.density(grid.points()[inside])
+    hu = body + coverage(distance, width) * (tissue - body)
     draw_lung_trees(hu, thorax.trees[thorax.index(spec.side)], grid, width)
     _paint_nodule(hu, grid, thorax, width)
     noise = ndimage.gaussian_filter(rng.standard_normal(grid.shape, dtype=np.float32), 0.5)

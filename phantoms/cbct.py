@@ -22,10 +22,10 @@ class Scanner:
     middle; rim: share gained at the edge of the field of view; noise: HU; end: mm of bad slices at either end."""
 
     fov: float = 240.0
-    blur: float = 0.7
+    blur: float = 0.9
     cupping: float = 0.06
     rim: float = 0.10
-    noise: float = 28.0
+    noise: float = 22.0
     end: float = 12.0
 
 

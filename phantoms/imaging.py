@@ -71,7 +71,8 @@ def image_state(thorax: Thorax, body: Volume, state: State, grid: Grid) -> Pictu
     del x
     edge = state.lung.sample(source) * np.cbrt(ratio)
     share = np.ones_like(edge) if state.held else coverage(edge, width)
-    tissue = np.minimum((thorax.parenchyma.sample(source) + 1000) / ratio - 1000, 40.0)
+    resting = thorax.parenchyma.sample(source) + thorax.fissure.density(source)
+    tissue = np.minimum((resting + 1000) / ratio - 1000, 40.0)
     lesion = coverage(thorax.nodule.distance(source) * np.cbrt(ratio), width) * share
     tissue += lesion * (NODULE_HU - tissue)
     inner = PLEURAL_AIR_HU + share * (tissue - PLEURAL_AIR_HU)

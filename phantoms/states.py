@@ -60,11 +60,12 @@ def make_states(
 def _uneven(
     thorax: Thorax, lung: Lattice, points: Array, patchiness: float, rng: np.random.Generator
 ) -> tuple[Array, Array]:
-    """Shear modulus (kPa) and factor on the rest volume at points: patchy tissue, a stiff root, a stiff nodule."""
+    """Shear modulus (kPa) and factor on the rest volume: patchy tissue, soft fissure, stiff root and nodule."""
     hilum = thorax.hila[thorax.index(thorax.side)]
     shear = 0.65 * np.exp(0.45 * patchiness * lung.like(smooth_noise(lung, 32.0, rng)).at(points))
     slack = np.exp(0.22 * patchiness * lung.like(smooth_noise(lung, 38.0, rng)).at(points))
     shear *= 1 + 5 * np.exp(-((np.linalg.norm(points - hilum, axis=1) / 24) ** 2))
+    shear *= 1 - 0.85 * np.exp(-((thorax.fissure.distance(points) / 8) ** 2))
     lesion = coverage(thorax.nodule.distance(points), 8.0)
     return shear * (1 + 10 * lesion), slack + lesion * (1.6 - slack)
 
@@ -88,4 +89,4 @@ def _about(centre: Array, rng: np.random.Generator, degrees: float, shift_mm: fl
 def scanned_centre(thorax: Thorax) -> Array:
     """Middle of the scanner's field of view in the frame of the CT."""
     sign = 1 if thorax.side == "right" else -1
-    return np.array([sign * 50.0, -8.0, -42.0])
+    return np.array([sign * 56.0, -6.0, -42.0])

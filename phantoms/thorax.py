@@ -45,8 +45,29 @@ class Nodule:
 
 
 @dataclass(frozen=True)
+class Fissure:
+    """Oblique fissure between the lobes of a lung. hilum: (3,) RAS mm, which it passes; slope: mm up per mm back;
+    bow: mm the sheet bulges at 60 mm from the hilum."""
+
+    hilum: Array
+    slope: float
+    bow: float
+
+    def distance(self, points: Array) -> Array:
+        """Distance in mm of points (..., 3) in the CT from the sheet, positive above it."""
+        d = points - self.hilum
+        bulge = self.bow * ((d[..., 0] ** 2 + d[..., 1] ** 2) / 3600 - 0.5)
+        return (d[..., 2] + self.slope * d[..., 1] + 8 + bulge) / np.sqrt(1 + self.slope**2)
+
+    def density(self, points: Array) -> Array:
+        """HU that the sheet of pleura adds at points (..., 3)."""
+        return 150 * np.exp(-((self.distance(points) / 0.9) ** 2))
+
+
+@dataclass(frozen=True)
 class Thorax:
-    """A person. parenchyma: HU of the lung's tissue without its trees, in the CT; hila: (right, left) RAS mm."""
+    """A person. parenchyma: HU of the lung's tissue without its trees, in the CT; hila: (right, left) RAS mm; fissure:
+    that of the operated lung."""
 
     shapes: Shapes
     spine: list[Vertebra]
@@ -54,6 +75,7 @@ class Thorax:
     hila: tuple[Array, Array]
     trees: tuple[LungTrees, LungTrees]
     nodule: Nodule
+    fissure: Fissure
     side: str
     seed: int
 
@@ -77,7 +99,8 @@ def draw_thorax(side: str, nodule_depth: float, nodule_radius: float, seed: int)
     trees = (_lung_trees(shapes.right_lung, hila[0], 1, rng), _lung_trees(shapes.left_lung, hila[1], -1, rng))
     centre = _place_nodule(shapes.lung(side), nodule_depth, 1 if side == "right" else -1, rng)
     nodule = Nodule(centre, nodule_radius, 0.12 * nodule_radius)
-    return Thorax(shapes, spine, _parenchyma(shapes, rng), hila, trees, nodule, side, seed)
+    fissure = Fissure(hila[0 if side == "right" else 1], rng.uniform(0.7, 1.1), rng.uniform(-8, 8))
+    return Thorax(shapes, spine, _parenchyma(shapes, rng), hila, trees, nodule, fissure, side, seed)
 
 
 def ct_grid(thorax: Thorax, spacing: tuple[float, float, float]) -> Grid:
@@ -124,7 +147,7 @@ def draw_lung_trees(hu: Array, trees: LungTrees, grid: Grid, width: float) -> No
 def draw_airways(hu: Array, grid: Grid, ends: Array, radii: Array, width: float) -> None:
     """Paint tubes with a wall and air inside. radii: (n, 2) mm of the lumen."""
     wall, lumen = np.zeros(grid.shape, dtype=np.float32), np.zeros(grid.shape, dtype=np.float32)
-    draw_tubes(wall, grid, ends, radii + 0.5 + 0.14 * radii, width)
+    draw_tubes(wall, grid, ends, radii + 0.4 + 0.12 * radii, width)
     draw_tubes(lumen, grid, ends, radii, width)
     hu += wall * (WALL_HU - hu)
     hu += lumen * (AIR_HU - hu)
@@ -136,13 +159,15 @@ def _soft_tissue(thorax: Thorax, grid: Grid, width: float, rng: np.random.Genera
     fibres = smooth_noise(s.body, 5.0, rng)
     patches = smooth_noise(s.body, 9.0, rng)
     fat = b.fat[1] + (b.fat[0] - b.fat[1]) * smoothstep(y, -20, 60) + 1.5 * patches
-    wall = 52 - 150 * smoothstep(fibres, 1.1, 1.7) + 6 * patches
+    plane = np.abs(s.body.values + fat + 10 + 4 * patches) - 1.5
+    wall = 52 - 150 * np.maximum(smoothstep(fibres, 1.1, 1.7), smoothstep(-plane, -1.5, 1.0)) + 6 * patches
     outside = wall + smoothstep(s.body.values + fat, -1.5, 1.5) * (-102 + 5 * patches - wall)
     middle = 15 - 95 * smoothstep(patches + 0.02 * y, -0.4, 1.0)
     belly = _belly(thorax, x, y, z, patches)
     below = smoothstep(-s.below_diaphragm.values, -1.5, 1.5)
     inside = middle + below * (belly - middle)
-    inside = inside + smoothstep(-s.heart.values, -1.5, 1.5) * (38 + 3 * patches - inside)
+    rind = smoothstep(s.heart.values, -6, -2) * smoothstep(patches, -0.6, 0.8)
+    inside = inside + smoothstep(-s.heart.values, -1.5, 1.5) * (38 + 3 * patches - 118 * rind - inside)
     field = inside + smoothstep(s.cage.values, -1.5, 1.5) * (outside - inside)
     hu = s.body.like(field).on(grid)
     skin = s.body.on(grid)
@@ -205,21 +230,33 @@ def _lung_trees(lung: Lattice, hilum: Array, sign: int, rng: np.random.Generator
     coarse = np.argwhere(lung.values[::2, ::2, ::2] < -1.0) * 2.0 * lung.spacing + lung.origin
     cloud = coarse + rng.uniform(-3, 3, coarse.shape)
     inward = np.array([sign * 12.0, -2.0, -6.0])
-    bundle = grow(cloud, hilum - 0.6 * inward, hilum + 0.8 * inward, 26, 0.62, 2.75)
+    bundle = grow(cloud, hilum - 0.6 * inward, hilum + 0.8 * inward, 24, 0.68, 2.8)
     veins = grow(
         cloud + rng.uniform(-5, 5, cloud.shape),
         hilum + np.array([0, 12, -14]) - 0.6 * inward,
         hilum + np.array([0, 11, -16]) + 0.8 * inward,
-        26,
-        0.58,
-        2.75,
+        24,
+        0.64,
+        2.8,
     )
+    bundle, veins = (t.moved(_keep_inside(t, lung)) for t in (bundle, veins))
     across = rng.standard_normal(bundle.nodes.shape)
     across /= np.linalg.norm(across, axis=1, keepdims=True)
     across = 0.3 * across + 0.7 * np.array([0.3 * sign, 0.5, 0.8])
     artery = bundle.moved(bundle.nodes + across * (2.1 * bundle.radius[:, None] + 0.8))
-    bronchi = bundle.moved(bundle.nodes, 0.78).keep(bundle.generation <= 6)
+    bronchi = bundle.moved(bundle.nodes, 0.72).keep(bundle.generation <= 7)
     return LungTrees(bronchi, artery, veins)
+
+
+def _keep_inside(tree: Tree, lung: Lattice) -> Array:
+    """Nodes (n, 3) of a tree, those that left the lung brought back 4 mm below its surface."""
+    nodes = tree.nodes.copy()
+    beyond = tree.generation > 1
+    for _ in range(4):
+        distance, slope = lung.with_gradient(nodes[beyond])
+        steep = np.maximum((slope**2).sum(axis=1, keepdims=True), 0.25)
+        nodes[beyond] -= np.maximum(distance + 4, 0)[:, None] * slope / steep
+    return nodes
 
 
 def _place_nodule(lung: Lattice, depth: float, sign: int, rng: np.random.Generator) -> Array:

@@ -45,8 +45,9 @@ class Tree:
 def grow(cloud: Array, root: Array, hilum: Array, leaf_points: int, leaf_radius: float, exponent: float) -> Tree:
     """Tree from `root` through `hilum` that fills a point cloud (n, 3) by repeated halving.
 
-    Every branch runs part of the way to the middle of the points it feeds; clouds below `leaf_points` end it. Radii
-    follow r^exponent of the parent = sum over its children, from `leaf_radius` mm at the ends.
+    Every branch runs part of the way to the middle of the points it feeds, a smaller part near the root; clouds below
+    `leaf_points` end it. Radii follow r^exponent of the parent = sum over its children, from `leaf_radius` mm at the
+    ends.
     Ref: Tawhai 2000 (halving); Murray 1926 (radii).
     """
     nodes, parent, generation = [root, hilum], [-1, 0], [0, 0]
@@ -57,7 +58,7 @@ def grow(cloud: Array, root: Array, hilum: Array, leaf_points: int, leaf_radius:
         for half in _halves(points, along):
             start = nodes[at]
             leaf = len(half) < leaf_points
-            share = 0.95 if leaf else 0.42
+            share = 0.95 if leaf else min(0.26 + 0.025 * depth, 0.45)
             end = start + share * (half.mean(axis=0) - start)
             nodes.append(end)
             parent.append(at)

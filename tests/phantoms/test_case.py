@@ -51,7 +51,8 @@ def test_mass_of_the_lung_is_kept(demo: PhantomCase) -> None:
     nothing = Tree(np.zeros((1, 3)), np.array([-1]), np.zeros(1), np.zeros(1, dtype=int))
     bare = replace(demo.thorax.trees[0], airway=nothing, artery=nothing, vein=nothing)
     far = replace(demo.thorax.nodule, centre=np.array([1e4, 0.0, 0.0]))
-    thorax = replace(demo.thorax, trees=(bare, bare), nodule=far)
+    sheet = replace(demo.thorax.fissure, hilum=np.array([0.0, 0.0, 1e4]))
+    thorax = replace(demo.thorax, trees=(bare, bare), nodule=far, fissure=sheet)
     lung = demo.inflated.lung
     inside = lung.values.ravel() < 0
     before = (thorax.parenchyma.at(lung.points()[inside]) + 1000).sum() * lung.spacing**3
