@@ -226,13 +226,16 @@ def _piecewise_linear(x: Array, y: Array, weight: Array, knots: Array) -> Array:
 
 
 def tissue_hu(hu: Array) -> dict[str, float]:
-    """Histogram peaks: "air" below -880, "lung" from -880 to -500, "soft" tissue from -150 to 200 HU (nan: none)."""
-    counts, edges = np.histogram(hu, bins=np.arange(-1100.0, 300.0, 8.0))
+    """Histogram peaks: "air" below -880, "lung" from -930 to -500, "soft" tissue from -150 to 200 HU (nan: none)."""
+    counts = np.bincount(np.clip((hu + 1104.0) / 8.0, 0, 175).astype(int), minlength=176)[1:-1]
     smooth = ndimage.gaussian_filter1d(counts.astype(float), 1.5)
-    centre = (edges[:-1] + edges[1:]) / 2
+    centre = -1092.0 + 8.0 * np.arange(counts.size)
+    peak = np.zeros(counts.size, dtype=bool)
+    peak[1:-1] = (smooth[1:-1] > smooth[:-2]) & (smooth[1:-1] >= smooth[2:]) & (smooth[1:-1] > 1e-4 * hu.size)
     out = {}
-    for name, (lo, hi) in {"air": (-1100, -880), "lung": (-880, -500), "soft": (-150, 200)}.items():
-        part = (centre >= lo) & (centre < hi)
-        top = int(np.where(part, smooth, -1).argmax())
-        out[name] = float(centre[top]) if smooth[top] > 1e-4 * hu.size else float("nan")
+    for name, (lo, hi) in {"air": (-1100, -880), "lung": (-930, -500), "soft": (-150, 200)}.items():
+        part = np.where(peak & (centre >= lo) & (centre < hi), smooth, 0.0)
+        out[name] = float(centre[int(part.argmax())]) if part.any() else float("nan")
+    if out["air"] == out["lung"]:
+        out["air"] = float("nan")
     return out

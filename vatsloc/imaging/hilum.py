@@ -17,6 +17,7 @@ from vatsloc.imaging.thorax import working_scene
 BAND_MM = 5.0
 RADIUS_MM = 20.0
 LEAST_ENTRY_ML = 0.1
+REACH_MM = 30.0
 
 
 @dataclass(frozen=True)
@@ -52,7 +53,7 @@ def find_hilum(lung: Mask, airways: Mask, side: Side) -> Hilum:
     return Hilum(medial.mean(axis=0), RADIUS_MM, False)
 
 
-def track_hilum(cbct: PreparedCbct, expected: Mask, hilum_ras: Array, radius_mm: float = 45.0) -> TrackedAirways:
+def track_hilum(cbct: PreparedCbct, expected: Mask, hilum_ras: Array, radius_mm: float = 30.0) -> TrackedAirways:
     """The bronchi about the hilum found again in a CBCT: their move as a whole, its contrast and runner-up.
 
     expected: airways in this CBCT's frame, hilum_ras: (3,) likewise. The move is the plain answer to how far the hilum
@@ -63,4 +64,4 @@ def track_hilum(cbct: PreparedCbct, expected: Mask, hilum_ras: Array, radius_mm:
     at = np.argwhere(tubes)
     far = np.linalg.norm(work.grid.to_ras(at.astype(float)) - hilum_ras, axis=1) > radius_mm
     tubes[tuple(at[far].T)] = False
-    return track_airways(work, seen, tubes)
+    return track_airways(work, seen, tubes, REACH_MM)

@@ -55,27 +55,47 @@ def find_pneumothorax(cbct: PreparedCbct, prior: ThoraxPrior) -> Pneumothorax:
     """
     work, seen = working_scene(cbct)
     space, airways = lung_space(work, seen, prior)
-    fine = working_copy(cbct.volume, FINE_MM)
-    fine = Volume(ndimage.gaussian_filter(fine.hu, SMOOTHING_MM / fine.grid.spacing), fine.ras_from_ijk)
-    near = on_grid(dilate(space, 2.5, work.grid.spacing), work.grid, fine.grid).inside
-    near &= on_grid(cbct.field.mask.inside, cbct.volume.grid, fine.grid).inside
-    aerated = near & (fine.hu < AERATED_HU)
+    whole = working_copy(cbct.volume, FINE_MM)
+    whole = Volume(ndimage.gaussian_filter(whole.hu, SMOOTHING_MM / whole.grid.spacing), whole.ras_from_ijk)
+    near = on_grid(dilate(space, 2.5, work.grid.spacing) & seen, work.grid, whole.grid).inside
+    box = bounding_box(near, np.full(3, 3)) if near.any() else (slice(0, 1),) * 3
+    part = whole.grid.box(np.array([b.start for b in box]), np.array([b.stop for b in box]))
+    fine = Volume(whole.hu[box], part.ras_from_ijk)
+    aerated = near[box] & (fine.hu < AERATED_HU)
     limit, contrast = _air_limit(fine.hu[aerated][::7])
-    voxel_ml = float(fine.grid.spacing.prod()) / 1000
     air = np.zeros(fine.grid.shape, dtype=bool)
     if contrast >= LEAST_CONTRAST_HU:
-        tubes = on_grid(dilate(airways.inside, 4.0, work.grid.spacing), work.grid, fine.grid).inside
-        sure = _pleural(aerated & (fine.hu < limit - 0.4 * contrast), tubes, voxel_ml)
-        coarse = _flooded(work, space, on_grid(sure, fine.grid, work.grid).inside, limit)
-        level = _upsampled(_local_limit(work, space, coarse, limit, contrast), work.grid, fine.grid)
-        core, reach = erode(coarse, 1.5, work.grid.spacing), dilate(coarse, 2.5, work.grid.spacing)
-        dark = (fine.hu < level) & on_grid(reach, work.grid, fine.grid).inside
-        dark |= on_grid(core, work.grid, fine.grid).inside
-        air = _pleural(ndimage.uniform_filter((aerated & dark).astype(np.float32), 3) > 0.5, tubes, voxel_ml)
+        air = _pleural_air(fine, aerated, work, space, airways.mask.inside, (limit, contrast))
     lung = _lung_beside(aerated, air, fine.grid, work.grid)
-    masks = [Mask(m, fine.ras_from_ijk) for m in (air, lung, air | lung)]
+    voxel_ml = float(fine.grid.spacing.prod()) / 1000
     air_ml, lung_ml = (float(m.sum()) * voxel_ml for m in (air, lung))
-    return Pneumothorax(masks[0], masks[1], masks[2], fine, limit, contrast, air_ml, lung_ml, airways)
+    masks = [Mask(_put(m, box, whole.grid), whole.ras_from_ijk) for m in (air, lung, air | lung)]
+    return Pneumothorax(masks[0], masks[1], masks[2], whole, limit, contrast, air_ml, lung_ml, airways)
+
+
+def _put(inside: Array, box: tuple[slice, ...], grid: Grid) -> Array:
+    out = np.zeros(grid.shape, dtype=bool)
+    out[box] = inside
+    return out
+
+
+def _pleural_air(
+    fine: Volume, aerated: Array, work: Volume, space: Array, airways: Array, levels: tuple[float, float]
+) -> Array:
+    """Air on the fine grid: where an edge parts it from the lung on the working grid, sharpened by a local level.
+
+    levels: HU half-way between air and lung, and their distance.
+    """
+    limit, contrast = levels
+    spacing = work.grid.spacing
+    tubes = on_grid(dilate(airways, 4.0, spacing), work.grid, fine.grid).inside
+    voxel_ml = float(fine.grid.spacing.prod()) / 1000
+    sure = _large_pieces(aerated & (fine.hu < limit - 0.4 * contrast), tubes, voxel_ml)
+    coarse = _flooded(work, space, on_grid(sure, fine.grid, work.grid).inside, limit)
+    level = _upsampled(_local_limit(work, space, coarse, limit, contrast), work.grid, fine.grid)
+    dark = (fine.hu < level) & on_grid(dilate(coarse, 2.5, spacing), work.grid, fine.grid).inside
+    dark |= on_grid(erode(coarse, 1.5, spacing), work.grid, fine.grid).inside
+    return _large_pieces(ndimage.uniform_filter((aerated & dark).astype(np.float32), 3) > 0.5, tubes, voxel_ml)
 
 
 def _air_limit(hu: Array) -> tuple[float, float]:
@@ -133,7 +153,7 @@ def _upsampled(values: Array, source: Grid, target: Grid) -> Array:
     return ndimage.affine_transform(values, np.diag(step[:3, :3]), step[:3, 3], target.shape, order=1, mode="nearest")
 
 
-def _pleural(dark: Array, tubes: Array, voxel_ml: float) -> Array:
+def _large_pieces(dark: Array, tubes: Array, voxel_ml: float) -> Array:
     """Dark pieces of at least 0.5 ml that are not airways."""
     labels, count = ndimage.label(dark)
     ml = np.bincount(labels.ravel(), minlength=count + 1) * voxel_ml

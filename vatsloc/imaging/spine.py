@@ -75,14 +75,14 @@ def segment_spine(image: Volume, usable: Mask | None = None, rim_mm: float = 3.0
 def bone_threshold(hu: Array) -> float:
     """HU above which tissue is bone, set from the image's own soft-tissue peak and its brightest tail.
 
-    A third of the way from the peak between -200 and 200 HU to the 99.8th percentile, at least 100 HU above the peak:
+    42 % of the way from the peak between -200 and 200 HU to the 99.8th percentile, at least 100 HU above the peak:
     cupping and a wrong scale move both ends alike.
     """
     counts, edges = np.histogram(hu, bins=np.arange(-200.0, 201.0, 10.0))
     smooth = ndimage.gaussian_filter1d(counts.astype(float), 2.0)
     soft = float(edges[int(smooth.argmax())] + 5.0)
     dense = float(np.percentile(hu, 99.8))
-    return max(soft + 0.33 * (dense - soft), soft + 100.0)
+    return max(soft + 0.42 * (dense - soft), soft + 100.0)
 
 
 def _column(work: Volume, excess: Array, seen: Array, slices: Array) -> Array:
