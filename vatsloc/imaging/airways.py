@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from registration.volume import Array, Mask, Volume
+from registration.volume import Array, Volume
 from vatsloc.imaging.lattice import bounding_box, dilate, touching
 
 TUBE_AREA_MM2 = (50.0, 900.0)
@@ -83,12 +83,12 @@ def grow_airways(work: Volume, seed: Array) -> Array:
 
 @dataclass(frozen=True)
 class TrackedAirways:
-    """Airways found again in a CBCT. mask: their lumen, on a 2 mm grid; shift_mm: (3,) RAS move of the expected tree.
+    """Airways found again in a CBCT. inside: their lumen, on the working grid; shift_mm: (3,) RAS move of the expected tree.
 
     contrast_hu: wall minus lumen at the place found; the runner-up is the best place at least 8 mm away.
     """
 
-    mask: Mask
+    inside: Array
     shift_mm: Array
     contrast_hu: float
     runner_up_hu: float
@@ -101,7 +101,7 @@ def track_airways(work: Volume, seen: Array, expected: Array, reach_mm: float = 
     then dark voxels connected to it and not far from it are taken.
     """
     spacing = work.grid.spacing
-    nothing = TrackedAirways(Mask(np.zeros_like(expected), work.ras_from_ijk), np.zeros(3), 0.0, 0.0)
+    nothing = TrackedAirways(np.zeros_like(expected), np.zeros(3), 0.0, 0.0)
     if (expected & seen).sum() * spacing.prod() < 500.0:
         return nothing
     wall = dilate(expected, 4.5, spacing) & ~dilate(expected, 2.0, spacing)
@@ -126,7 +126,7 @@ def track_airways(work: Volume, seen: Array, expected: Array, reach_mm: float = 
     tubes = touching(dark, moved & dark)
     shift_mm = work.grid.ras_from_ijk[:3, :3] @ (best + _between_voxels(fine, peak))
     runner_up = float(score[away].max()) if away.any() else 0.0
-    return TrackedAirways(Mask(tubes & seen, work.ras_from_ijk), shift_mm, float(fine.max()), runner_up)
+    return TrackedAirways(tubes & seen, shift_mm, float(fine.max()), runner_up)
 
 
 def _contrasts(hu: Array, lumen_ijk: Array, wall_ijk: Array, steps: Array) -> Array:

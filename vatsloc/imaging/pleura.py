@@ -65,7 +65,7 @@ def find_pneumothorax(cbct: PreparedCbct, prior: ThoraxPrior) -> Pneumothorax:
     limit, contrast = _air_limit(fine.hu[aerated][::7])
     air = np.zeros(fine.grid.shape, dtype=bool)
     if contrast >= LEAST_CONTRAST_HU:
-        air = _pleural_air(fine, aerated, work, space, airways.mask.inside, (limit, contrast))
+        air = _pleural_air(fine, aerated, work, space, airways.inside, (limit, contrast))
     lung = _lung_beside(aerated, air, fine.grid, work.grid)
     voxel_ml = float(fine.grid.spacing.prod()) / 1000
     air_ml, lung_ml = (float(m.sum()) * voxel_ml for m in (air, lung))

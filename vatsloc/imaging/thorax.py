@@ -83,9 +83,9 @@ def lung_space(work: Volume, seen: Array, prior: ThoraxPrior) -> tuple[Array, Tr
     tubes &= ~erode(lung, 6.0, spacing) & ~erode(other, 6.0, spacing)
     airways = track_airways(work, seen, tubes)
     near = dilate(lung, 15.0, spacing) | dilate(other, 10.0, spacing)
-    aerated = (work.hu < AERATED_HU) & seen & near & ~dilate(airways.mask.inside, 2.5, spacing)
+    aerated = (work.hu < AERATED_HU) & seen & near & ~dilate(airways.inside, 2.5, spacing)
     depth = ndimage.distance_transform_edt(aerated, sampling=spacing)
-    return _grow(_owners(depth, lung, other, airways.mask.inside), aerated) == 1, airways
+    return _grow(_owners(depth, lung, other, airways.inside), aerated) == 1, airways
 
 
 def _on(mask: Mask, grid: Grid) -> Array:
