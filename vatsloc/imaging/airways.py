@@ -83,7 +83,7 @@ def grow_airways(work: Volume, seed: Array) -> Array:
 
 @dataclass(frozen=True)
 class TrackedAirways:
-    """Airways found again in a CBCT. inside: their lumen, on the working grid; shift_mm: (3,) RAS move of the expected tree.
+    """Airways found again in a CBCT. inside: lumen on the working grid; shift_mm: (3,) RAS move of the expected tree.
 
     contrast_hu: wall minus lumen at the place found; the runner-up is the best place at least 8 mm away.
     """
