@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from poro.mesh.tetmesh import Array
 from poro.solver import LinearSolver
@@ -59,10 +59,10 @@ class Compliance:
         return _apply(self._blocks, self._place[columns], force[columns])
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True)
 def _between(blocks: Array, rows: Array, along: Array, columns: Array, push: Array) -> Array:
     result = np.empty((len(columns), len(rows)))
-    for j in prange(len(columns)):
+    for j in range(len(columns)):
         block = blocks[columns[j]]
         for i in range(len(rows)):
             c = block[rows[i]]
@@ -73,11 +73,11 @@ def _between(blocks: Array, rows: Array, along: Array, columns: Array, push: Arr
     return result.T
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True)
 def _apply(blocks: Array, columns: Array, force: Array) -> Array:
     u = np.zeros((blocks.shape[1], 3))
     width = 128
-    for chunk in prange((blocks.shape[1] + width - 1) // width):
+    for chunk in range((blocks.shape[1] + width - 1) // width):
         last = min((chunk + 1) * width, blocks.shape[1])
         for j in range(len(columns)):
             x, y, z = force[j, 0], force[j, 1], force[j, 2]

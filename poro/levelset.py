@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from scipy import ndimage
 
 from poro.mesh.closest import closest_points
@@ -48,10 +48,10 @@ def _weights(t: float, step: float) -> tuple[Array, Array, Array]:
     return w, d / step, s / step**2
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True)
 def _evaluate(c: Array, ijk: Array, step: float) -> tuple[Array, Array, Array]:
     value, gradient, hessian = np.zeros(len(ijk)), np.zeros((len(ijk), 3)), np.zeros((len(ijk), 3, 3))
-    for q in prange(len(ijk)):
+    for q in range(len(ijk)):
         # Beyond the grid the surface is far away: the border's distance is all that contact needs.
         x = min(max(ijk[q, 0], 1.0), c.shape[0] - 2.001)
         y = min(max(ijk[q, 1], 1.0), c.shape[1] - 2.001)

@@ -44,11 +44,17 @@ def unknowns_of(nodes: Array) -> Array:
     return (np.asarray(nodes)[:, None] * 3 + np.arange(3)).ravel()
 
 
+def _centred(points: Array) -> Array:
+    return points - points.mean(axis=0) if len(points) else np.zeros((1, 3))
+
+
 def solid(mesh: TetMesh, tissue: Tissue, fixed: Array, springs: csr_matrix | None = None) -> Solid:
     """Factorize the elastic stiffness, plus optional springs (3n, 3n) kPa mm, with the nodes `fixed` held.
 
     Raises ValueError when neither fixed nodes nor springs hold the body.
     """
+    if springs is None and np.linalg.matrix_rank(_centred(mesh.points[fixed]), tol=1e-6) < 2:
+        raise ValueError(f"{len(np.unique(fixed))} held nodes let the body move freely; hold three that span a plane")
     matrix = stiffness(mesh, tissue.lame_kpa, tissue.shear_kpa)
     if springs is not None:
         matrix = (matrix + springs).tocsr()

@@ -56,6 +56,8 @@ def stuff(inside: Array, ras_from_ijk: Array, edge_mm: float) -> TetMesh:
 
     Raises ValueError when the mask is empty or too thin to hold one element, or when an angle falls below 8 degrees.
     """
+    if not edge_mm > 0:
+        raise ValueError(f"edge_mm must be positive, got {edge_mm}")
     step = edge_mm / 4
     distance, affine = signed_distance(inside, ras_from_ijk, step, 0.8 * step)
     inverse = np.linalg.inv(affine)
@@ -71,8 +73,6 @@ def stuff(inside: Array, ras_from_ijk: Array, edge_mm: float) -> TetMesh:
 
 def stuff_level_set(level: Callable[[Array], Array], lower: Array, upper: Array, edge_mm: float) -> TetMesh:
     """Tetrahedra that fill {level > 0} inside the box lower..upper (3,) mm; level maps points (n, 3) to (n,)."""
-    if not edge_mm > 0:
-        raise ValueError(f"edge_mm must be positive, got {edge_mm}")
     points, tets = _lattice(np.asarray(lower, float), np.asarray(upper, float), edge_mm / _MEAN_EDGE)
     value = level(points)
     tets = tets[(value[tets] > 0).any(axis=1)]

@@ -1,0 +1,185 @@
+"""Contact against a closed form, an independent quadratic program, equilibrium on a curved wall, finite differences."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.linalg import cholesky
+from scipy.optimize import nnls
+from shapes import box, ellipsoid
+
+from poro.assembly import body_load
+from poro.compliance import Compliance
+from poro.contact import (
+    ContactStatus,
+    Linearized,
+    Obstacle,
+    Springs,
+    complementarity,
+    contact_sensitivity,
+    settle,
+)
+from poro.levelset import LevelSet, level_set
+from poro.mesh.tetmesh import Array, TetMesh
+from poro.solid import Solid, solid, unknowns_of
+from poro.tissue import GRAVITY_KPA_PER_MM, Tissue
+
+
+def _floor(height: float) -> LevelSet:
+    """Distance above the plane z = height; a cubic B-spline reproduces it exactly."""
+    grid = np.broadcast_to((np.arange(60) * 5.0 - 100 - height)[None, None], (40, 40, 60)).copy()
+    return LevelSet(grid, np.array([-100.0, -100.0, -100.0]), 5.0)
+
+
+def _compliance(body: Solid, nodes: Array) -> Compliance:
+    place = np.full(3 * len(body.mesh.points), -1)
+    place[body.free_unknowns] = np.arange(len(body.free_unknowns))
+    return Compliance(body.solver, place[unknowns_of(nodes)].reshape(-1, 3), len(body.free_unknowns))
+
+
+def _obstacle(mesh: TetMesh, level: LevelSet, nodes: Array) -> Obstacle:
+    rest = mesh.points[nodes]
+    return Obstacle(level, rest, np.zeros(len(nodes), bool), np.array([0, 0, 1.0]), np.zeros(len(nodes)))
+
+
+def test_block_pressed_on_a_floor_carries_uniform_pressure() -> None:
+    """nu = 0, top pushed down by d: sigma = E d / H everywhere, exact for linear elements."""
+    tissue, height, push = Tissue(poisson=0.0), 30.0, 3.0
+    mesh = box((4, 4, 5), (20.0, 20.0, height))
+    top, bottom = (np.flatnonzero(mesh.points[:, 2] == z) for z in (height, 0.0))
+    body = solid(mesh, tissue, top)
+    imposed = np.broadcast_to([0, 0, -push], (len(top), 3)).copy()
+    free = body.solve(np.zeros_like(mesh.points), imposed)
+    compliance = _compliance(body, bottom)
+    state = settle(compliance, _obstacle(mesh, _floor(0.0), bottom), free[bottom], 0.0)
+    assert state.status is ContactStatus.SETTLED
+    assert state.active.all()
+    assert_allclose(state.gap, 0, atol=1e-9)
+    boundary = mesh.boundary
+    floor_faces = (boundary.points[boundary.triangles, 2] == 0).all(axis=1)
+    area = np.bincount(
+        boundary.nodes[boundary.triangles[floor_faces]].ravel(),
+        np.repeat(boundary.areas[floor_faces] / 3, 3),
+        len(mesh.points),
+    )
+    assert_allclose(state.force / area[bottom], tissue.young_kpa * push / height, rtol=1e-8)
+
+
+def test_floor_out_of_reach_stays_untouched() -> None:
+    mesh = box((3, 3, 3), (20.0, 20.0, 20.0))
+    top, bottom = (np.flatnonzero(mesh.points[:, 2] == z) for z in (20.0, 0.0))
+    body = solid(mesh, Tissue(), top)
+    free = body.solve(body_load(mesh, np.array([0, 0, -100 * GRAVITY_KPA_PER_MM])))
+    state = settle(_compliance(body, bottom), _obstacle(mesh, _floor(-5.0), bottom), free[bottom], 0.0)
+    assert not state.active.any()
+    assert_allclose(state.u, free[bottom])
+    assert state.gap.min() == pytest.approx(5 + free[bottom, 2].min())
+
+
+class _Dense(Compliance):
+    """Compliance given as a matrix, for tests of the complementarity solver alone."""
+
+    def __init__(self, matrix: Array) -> None:
+        n = len(matrix) // 3
+        super().__init__(self, np.arange(3 * n).reshape(-1, 3), 3 * n)
+        self.matrix = matrix
+
+    def solve(self, right: Array) -> Array:
+        return self.matrix @ right
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_active_set_equals_a_quadratic_program(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    n = 40
+    root = rng.normal(size=(3 * n, 3 * n))
+    dense = root @ root.T / n + 0.05 * np.eye(3 * n)
+    gradient = rng.normal(size=(n, 3))
+    gradient /= np.linalg.norm(gradient, axis=1)[:, None]
+    free = rng.normal(size=(n, 3))
+    none = Springs(np.zeros(0, int), np.zeros((0, 3)), np.zeros(0), np.zeros((0, 0)))
+    wall = Linearized(_Dense(dense), np.zeros(n), gradient, np.zeros((n, 3)), free, none)
+    force, active, u, _, _ = complementarity(wall, rng.random(n) < 0.5)
+    rows = np.zeros((3 * n, n))
+    rows[np.arange(3 * n), np.repeat(np.arange(n), 3)] = gradient.ravel()
+    w, q = rows.T @ dense @ rows, rows.T @ free.ravel()
+    upper = cholesky(w)
+    expected, _ = nnls(upper, -np.linalg.solve(upper.T, q), maxiter=1000)
+    assert_allclose(force, expected, atol=1e-8 * max(1, np.abs(expected).max()))
+    assert_allclose(u.ravel(), free.ravel() + dense @ rows @ force, atol=1e-9 * np.abs(u).max())
+    assert (force[~active] == 0).all()
+
+
+@pytest.fixture(scope="module")
+def hollow() -> tuple[TetMesh, Solid, Array, Obstacle, Compliance]:
+    """A heavy ellipsoid hung by a few nodes inside its own outline."""
+    mesh = ellipsoid(16.0)
+    held = np.flatnonzero(np.linalg.norm(mesh.points - [-30, 0, 0], axis=1) < 16)
+    body = solid(mesh, Tissue(), held)
+    nodes = np.setdiff1d(mesh.boundary.nodes, held)
+    level = level_set(mesh.boundary, 6.0, 10.0)
+    rest = mesh.points[nodes]
+    moving = rest[:, 2] < -45
+    obstacle = Obstacle(level, rest, moving, np.array([0, 0, 1.0]), np.minimum(level.evaluate(rest)[0], 0))
+    return mesh, body, nodes, obstacle, _compliance(body, nodes)
+
+
+def test_level_set_derivatives() -> None:
+    level = level_set(ellipsoid(13.0).boundary, 6.0, 10.0)
+    x = np.random.default_rng(3).uniform(-50, 50, (40, 3))
+    _, gradient, hessian = level.evaluate(x)
+    h = 1e-4
+    for axis in range(3):
+        step = h * np.eye(3)[axis]
+        ahead, behind = level.evaluate(x + step), level.evaluate(x - step)
+        assert_allclose((ahead[0] - behind[0]) / (2 * h), gradient[:, axis], atol=1e-7)
+        assert_allclose((ahead[1] - behind[1]) / (2 * h), hessian[:, axis], atol=1e-7)
+    assert level.evaluate(np.zeros((1, 3)))[0][0] > 25
+    assert level.evaluate(np.array([[60.0, 0, 0]]))[0][0] < -10
+
+
+@pytest.mark.parametrize("density", [80.0, 250.0])
+def test_signorini_conditions_hold_on_a_curved_wall(hollow: tuple, density: float) -> None:
+    mesh, body, nodes, obstacle, compliance = hollow
+    load = body_load(mesh, np.array([0.6, 0, -0.8]) * density * GRAVITY_KPA_PER_MM)
+    free = body.solve(load)
+    state = settle(compliance, obstacle, free[nodes], 0.0)
+    assert state.status is ContactStatus.SETTLED
+    assert state.active.sum() > 10
+    assert state.gap.min() > -1e-3
+    assert (state.force >= 0).all()
+    assert_allclose(state.gap[state.force > 0], 0, atol=1e-4)
+    pushed = np.zeros_like(load)
+    pushed[nodes] = state.gradient * state.force[:, None]
+    u = free + body.solve(pushed)
+    assert_allclose(u[nodes], state.u, atol=1e-2)
+    assert state.moves[-1] < 1e-3
+    assert state.steps <= 12
+
+
+def test_contact_is_found_from_any_start(hollow: tuple) -> None:
+    mesh, body, nodes, obstacle, compliance = hollow
+    heavy, light = (
+        body.solve(body_load(mesh, np.array([0, 0, -d * GRAVITY_KPA_PER_MM])))[nodes] for d in (300.0, 60.0)
+    )
+    cold = settle(compliance, obstacle, light, 4.0, tolerance_mm=1e-8)
+    warm = settle(compliance, obstacle, light, 4.0, settle(compliance, obstacle, heavy, 0.0), tolerance_mm=1e-8)
+    assert_allclose(warm.u, cold.u, atol=1e-6)
+    assert (warm.active == cold.active).all()
+
+
+def test_sensitivity_of_contact_equals_finite_differences(hollow: tuple) -> None:
+    mesh, body, nodes, obstacle, compliance = hollow
+    direction = np.array([0.3, 0.2, -0.9]) * GRAVITY_KPA_PER_MM
+    unit = body.solve(body_load(mesh, direction))[nodes]
+    at = settle(compliance, obstacle, 150 * unit, 5.0, tolerance_mm=1e-9)
+    change = contact_sensitivity(compliance, obstacle, at, np.stack([unit, 0 * unit], axis=2), np.array([0.0, 1.0]))
+    for k, (load, travel) in enumerate(((1e-3, 0.0), (0.0, 1e-4))):
+        ahead, behind = (
+            settle(compliance, obstacle, (150 + s * load) * unit, 5.0 + s * travel, at, 1e-10) for s in (1, -1)
+        )
+        assert (ahead.active == behind.active).all()
+        total = [s.gradient * s.force[:, None] for s in (ahead, behind)]
+        difference = (total[0] - total[1]) / (2 * (load or travel))
+        assert_allclose(change[:, :, k], difference, atol=2e-4 * np.abs(difference).max())

@@ -1,0 +1,117 @@
+"""Elastic continuation: exact on affine data, soft tends to exact, inverted elements are caught, corrections obey
+springs.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from shapes import ellipsoid
+
+from poro.extrapolate import ExtrapolationStatus, Pull, correct, extrapolate
+from poro.mesh import interpolate, locate
+from poro.tissue import Tissue
+
+TISSUE = Tissue()
+GRADIENT = np.array([[-0.1, 0.02, 0.0], [0.03, -0.05, 0.04], [0.0, -0.02, 0.08]])
+
+
+def test_affine_motion_known_everywhere_but_the_apex_is_continued() -> None:
+    """The middle is imposed and the ends are free, as beyond a field of view; the ends stay close to the affine map."""
+    mesh = ellipsoid(11.0)
+    known = np.flatnonzero(np.abs(mesh.points[:, 2]) < 45)
+    exact = mesh.points @ GRADIENT.T + [3, -2, 5]
+    found = extrapolate(mesh, known, exact[known], TISSUE)
+    assert found.status is ExtrapolationStatus.SOLVED
+    assert_allclose(found.u[known], exact[known], atol=1e-12)
+    outside = np.setdiff1d(np.arange(len(mesh.points)), known)
+    assert np.linalg.norm((found.u - exact)[outside], axis=1).max() < 2.5
+    assert (
+        np.linalg.norm((found.u - exact)[outside], axis=1).mean() < 0.15 * np.linalg.norm(exact[outside], axis=1).mean()
+    )
+
+
+def test_interior_constraints_equal_lagrange_multipliers() -> None:
+    """Elimination is checked against the saddle-point system of the multipliers."""
+    from scipy.sparse import bmat, coo_matrix
+    from scipy.sparse.linalg import spsolve
+
+    from poro.assembly import stiffness
+
+    mesh = ellipsoid(20.0)
+    nodes = np.array([3, 17, 40, 61, 90])
+    values = np.random.default_rng(0).normal(size=(5, 3))
+    rows = (nodes[:, None] * 3 + np.arange(3)).ravel()
+    n = 3 * len(mesh.points)
+    pick = coo_matrix((np.ones(15), (np.arange(15), rows)), shape=(15, n))
+    saddle = bmat([[stiffness(mesh, TISSUE.lame_kpa, TISSUE.shear_kpa), pick.T], [pick, None]]).tocsc()
+    exact = spsolve(saddle, np.concatenate([np.zeros(n), values.ravel()]))[:n].reshape(-1, 3)
+    found = extrapolate(mesh, nodes, values, TISSUE, min_det=-np.inf)
+    assert_allclose(found.u, exact, atol=1e-9)
+
+
+def test_soft_constraints_tend_to_exact_ones() -> None:
+    mesh = ellipsoid(14.0)
+    nodes = np.flatnonzero(np.abs(mesh.points[:, 2]) < 30)
+    values = 0.5 * np.sin(mesh.points[nodes] / 20)
+    exact = extrapolate(mesh, nodes, values, TISSUE).u
+    gaps = [
+        np.abs(extrapolate(mesh, nodes, values, TISSUE, np.full(len(nodes), w)).u - exact).max()
+        for w in (1e1, 1e3, 1e5)
+    ]
+    assert gaps[2] < 1e-4
+    assert_allclose([gaps[0] / gaps[1], gaps[1] / gaps[2]], 100, rtol=0.35)
+
+
+def test_values_that_would_fold_the_mesh_are_released() -> None:
+    mesh = ellipsoid(12.0)
+    nodes = np.flatnonzero(np.abs(mesh.points[:, 2]) < 40)
+    values = np.zeros((len(nodes), 3))
+    wrong = np.argmin(np.linalg.norm(mesh.points[nodes], axis=1))
+    values[wrong] = [40, 0, 0]
+    found = extrapolate(mesh, nodes, values, TISSUE)
+    assert found.status is ExtrapolationStatus.RELEASED
+    assert nodes[wrong] in found.released
+    assert found.det_f.min() > 0.05
+    assert np.abs(found.u).max() < 1
+
+
+def test_too_few_nodes_are_refused() -> None:
+    with pytest.raises(ValueError, match="three or more"):
+        extrapolate(ellipsoid(25.0), np.array([0, 1]), np.zeros((2, 3)), TISSUE)
+
+
+def test_correction_recovers_a_smooth_residual_and_ignores_outliers() -> None:
+    mesh = ellipsoid(10.0)
+    rng = np.random.default_rng(4)
+    u = mesh.points @ GRADIENT.T
+
+    def hidden(x: np.ndarray) -> np.ndarray:
+        return 3 * np.stack([np.sin(x[:, 1] / 40), np.cos(x[:, 2] / 50), x[:, 0] / 40], 1)
+
+    inside = rng.uniform(-25, 25, (120, 3))
+    where = locate(mesh, inside)
+    now = inside + interpolate(where, u)
+    wanted = hidden(inside)
+    wanted[:10] += rng.normal(size=(10, 3)) * 30
+    pull = Pull(now, wanted, np.full(120, 0.5), np.zeros((120, 3)))
+    found = correct(mesh, u, TISSUE, pull)
+    fresh = rng.uniform(-25, 25, (200, 3))
+    left = interpolate(locate(mesh, fresh), found.u) - hidden(fresh)
+    assert np.linalg.norm(left, axis=1).mean() < 0.25 * np.linalg.norm(hidden(fresh), axis=1).mean()
+    assert (found.influence[:10] < 0.2).all()
+    assert (found.influence[10:] > 0.5).mean() > 0.9
+    assert found.det_f.min() > 0.2
+
+
+def test_normal_springs_leave_sliding_free() -> None:
+    mesh = ellipsoid(12.0)
+    s = mesh.boundary
+    pull = Pull(
+        s.points, np.broadcast_to([0.0, 4.0, 0.0], s.points.shape).copy(), np.full(len(s.points), 1.0), s.node_normals
+    )
+    found = correct(mesh, np.zeros_like(mesh.points), TISSUE, pull, robust=np.inf, rounds=1)
+    assert_allclose(found.u.mean(axis=0), [0, 4, 0], atol=0.2)
+    along = np.einsum("nd,nd->n", found.u[s.nodes] - [0, 4, 0], s.node_normals)
+    assert np.abs(along).max() < 0.4

@@ -1,0 +1,147 @@
+"""The forward model's derivative, targets of its own making, load modes, and the size of the ellipsoid."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from shapes import ellipsoid
+
+from poro.fit import Fit, FitSettings, FitStatus, ellipsoid95, fit
+from poro.mesh import interpolate, locate
+from poro.model import PoroState, PoroStatus, PoroSystem, Theta, assemble, sensitivity, solve
+from poro.modes import hilum_modes, shape_modes, shrinkage_modes
+from poro.observations import Observer, Target
+from poro.tissue import Tissue
+
+TISSUE = Tissue()
+GRAVITY = np.array([-1.0, 0.0, 0.0])
+TRUE = Theta(2e-8, 0.82, 6.0)
+
+
+@pytest.fixture(scope="module")
+def system() -> PoroSystem:
+    mesh = ellipsoid(15.0)
+    held = np.flatnonzero(np.linalg.norm(mesh.points - [-30, 0, 0], axis=1) < 16)
+    return assemble(mesh, TISSUE, GRAVITY, held, np.broadcast_to([1.0, 0, 2.0], (len(held), 3)))
+
+
+@pytest.fixture(scope="module")
+def truth(system: PoroSystem) -> PoroState:
+    return solve(system, TRUE)
+
+
+def _target(system: PoroSystem, state: PoroState, inner: int = 0) -> Target:
+    s = system.mesh.boundary
+    moved = s.moved(s.points + state.u[s.nodes])
+    seen = moved.points[:, 2] < 30
+    x = np.random.default_rng(5).uniform(-22, 22, (inner, 3))
+    y = x + interpolate(locate(system.mesh, x), state.u)
+    return Target(moved.points[seen], moved.node_normals[seen], np.ones(seen.sum()), x, y, np.ones(inner))
+
+
+def test_forward_solution_is_a_collapsed_lung_against_its_wall(system: PoroSystem, truth: PoroState) -> None:
+    assert truth.status is PoroStatus.SOLVED
+    ratio = (truth.det_f * system.mesh.volumes).sum() / system.mesh.volumes.sum()
+    assert 0.3 < ratio < 0.9
+    assert truth.gap.min() > -1e-3
+    assert (truth.contact_pressure[truth.active] > 0).all()
+    assert_allclose(truth.u[system.hilum], [[1.0, 0, 2.0]] * len(system.hilum), atol=1e-12)
+    assert truth.u[:, 0].mean() < 0
+
+
+def test_more_evacuation_means_less_volume_and_more_weight_more_sag(system: PoroSystem) -> None:
+    volume = [float((solve(system, Theta(k, 0.9)).det_f * system.mesh.volumes).sum()) for k in (1e-10, 1e-8, 1e-6)]
+    assert volume[0] > volume[1] > volume[2]
+    sag = [solve(system, Theta(1e-9, phi)).u[:, 0].mean() for phi in (0.9, 0.6)]
+    assert sag[1] < sag[0] < 0.5
+
+
+def test_sensitivity_equals_finite_differences(system: PoroSystem, truth: PoroState) -> None:
+    du = sensitivity(system, truth)
+    x = TRUE.vector()
+    for k, h in enumerate((1e-4, 1e-4, 1e-3)):
+        ahead, behind = (solve(system, Theta.of(x + s * h * np.eye(3)[k]), truth) for s in (1, -1))
+        assert (ahead.active == behind.active).all()
+        difference = (ahead.u - behind.u) / (2 * h)
+        assert_allclose(du[:, :, k], difference, atol=2e-3 * np.abs(difference).max())
+
+
+@pytest.mark.parametrize("plain", [False, True])
+def test_residuals_have_exact_derivatives(system: PoroSystem, truth: PoroState, plain: bool) -> None:
+    observer = Observer(system.mesh, _target(system, solve(system, Theta(1e-8, 0.85)), inner=12), plain)
+    du = np.random.default_rng(6).normal(size=(*truth.u.shape, 2))
+    rows = observer.residuals(truth.u)
+    h = 1e-6
+    for k in range(2):
+        ahead, behind = (observer.residuals(truth.u + s * h * du[:, :, k]).value for s in (1, -1))
+        smooth = np.abs(rows.value) > 1e-2
+        assert_allclose(rows.derivative(du)[smooth, k], ((ahead - behind) / (2 * h))[smooth], atol=1e-4)
+
+
+@pytest.fixture(scope="module")
+def recovered(system: PoroSystem, truth: PoroState) -> Fit:
+    settings = FitSettings(
+        surface_sigma_mm=0.5, keypoint_sigma_mm=0.5, correlation_mm=5.0, tolerance=1e-5, max_steps=40
+    )
+    return fit(system, _target(system, truth, inner=15), settings)
+
+
+def test_own_target_is_recovered(recovered: Fit, truth: PoroState) -> None:
+    """A target made by the model itself: a test of the inverse problem, not of the model."""
+    assert recovered.status is FitStatus.CONVERGED
+    assert np.log10(recovered.theta.kappa_b) == pytest.approx(np.log10(TRUE.kappa_b), abs=0.01)
+    assert recovered.theta.phi == pytest.approx(TRUE.phi, abs=0.005)
+    assert recovered.theta.d_diaph_mm == pytest.approx(TRUE.d_diaph_mm, abs=0.1)
+    assert np.linalg.norm(recovered.state.u - truth.u, axis=1).max() < 0.1
+    cost = [step.cost for step in recovered.history]
+    assert (np.diff(cost) <= 0).all()
+
+
+def test_ellipsoid_grows_with_what_is_unknown(recovered: Fit, system: PoroSystem) -> None:
+    axes, directions = ellipsoid95(recovered, system, np.array([5.0, 5, 5]))
+    assert (np.diff(axes) <= 0).all()
+    assert_allclose(directions.T @ directions, np.eye(3), atol=1e-12)
+    assert axes[0] < 2.0
+    assert np.linalg.eigvalsh(recovered.covariance).min() > 0
+
+
+def test_paper_cost_finds_the_same_lung_where_points_are_nodes(system: PoroSystem, truth: PoroState) -> None:
+    settings = FitSettings(plain=True, robust=np.inf, starts=((1e-8, 0.85, 4.0),), tolerance=1e-5)
+    found = fit(system, _target(system, truth), settings)
+    assert np.linalg.norm(found.state.u - truth.u, axis=1).mean() < 0.6
+
+
+def test_load_modes_are_recovered_from_inner_points(system: PoroSystem) -> None:
+    mesh = system.mesh
+    modes = (*shrinkage_modes(mesh, TISSUE, GRAVITY, 1, 0.1), *hilum_modes(mesh, system.hilum)[:1])
+    wide = assemble(mesh, TISSUE, GRAVITY, system.hilum, system.hilum_displacement, modes)
+    amplitudes = (-0.05, 0.04, -0.03, 0.02, 2.0)
+    state = solve(wide, Theta(1e-8, 0.85, 0.0, amplitudes))
+    settings = FitSettings(
+        surface_sigma_mm=0.3, keypoint_sigma_mm=0.3, correlation_mm=5.0, tolerance=1e-5, max_steps=40
+    )
+    found = fit(wide, _target(wide, state, inner=60), settings)
+    assert np.linalg.norm(found.state.u - state.u, axis=1).mean() < 0.15
+    assert_allclose(found.theta.modes[:4], amplitudes[:4], atol=0.03)
+    assert found.theta.modes[4] == pytest.approx(2.0, abs=0.5)
+
+
+def test_mode_sensitivity_equals_finite_differences(system: PoroSystem) -> None:
+    modes = shape_modes(system.mesh, TISSUE, GRAVITY, 0)
+    wide = assemble(system.mesh, TISSUE, GRAVITY, system.hilum, system.hilum_displacement, modes)
+    x = np.array([-8.0, 0.85, 2.0, -0.05, 0.02, 0.01, -0.04, 0.02, -0.03])
+    state = solve(wide, Theta.of(x))
+    du = sensitivity(wide, state)
+    for k in (3, 4, 8):
+        step = 1e-4 * np.eye(9)[k]
+        ahead, behind = (solve(wide, Theta.of(x + s * step), state) for s in (1, -1))
+        difference = (ahead.u - behind.u) / 2e-4
+        assert_allclose(du[:, :, k], difference, atol=2e-3 * np.abs(difference).max())
+
+
+def test_empty_targets_and_wrong_gravity_are_refused(system: PoroSystem) -> None:
+    with pytest.raises(ValueError, match="no point of positive weight"):
+        fit(system, Target(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)))
+    with pytest.raises(ValueError, match="unit vector"):
+        assemble(system.mesh, TISSUE, 2 * GRAVITY, system.hilum, system.hilum_displacement)

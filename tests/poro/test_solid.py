@@ -1,0 +1,173 @@
+"""Elasticity against closed forms: patch, rigid motions, gravity column, manufactured solution, and skfem's forms."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.sparse import csr_matrix
+from shapes import box, ellipsoid, order
+from skfem import Basis, BilinearForm, ElementTetP1, ElementVector, MeshTet
+from skfem.helpers import ddot, grad, sym_grad, trace
+
+from poro.assembly import (
+    body_load,
+    consistent_mass,
+    deformation_gradient,
+    eigenstress_load,
+    gradient_load,
+    laplacian,
+    stiffness,
+)
+from poro.mesh.tetmesh import Array, TetMesh
+from poro.modes import eigenstrain_mode
+from poro.solid import solid
+from poro.solver import Multigrid, linear_solver, rigid_modes
+from poro.tissue import GRAVITY_KPA_PER_MM, Tissue
+
+TISSUE = Tissue()
+
+
+def _basis(mesh: TetMesh, vector: bool) -> Basis:
+    return Basis(
+        MeshTet(mesh.points.T.copy(), mesh.tets.T.copy()), ElementVector(ElementTetP1()) if vector else ElementTetP1()
+    )
+
+
+def test_batched_assembly_equals_readable_forms() -> None:
+    mesh = ellipsoid(20.0)
+    lame, mu = TISSUE.lame_kpa, TISSUE.shear_kpa
+
+    @BilinearForm
+    def elasticity(u, v, w):  # type: ignore[no-untyped-def]
+        return lame * trace(grad(u)) * trace(grad(v)) + 2 * mu * ddot(sym_grad(u), sym_grad(v))
+
+    @BilinearForm
+    def diffusion(p, q, w):  # type: ignore[no-untyped-def]
+        return ddot(grad(p)[None], grad(q)[None])
+
+    @BilinearForm
+    def reaction(p, q, w):  # type: ignore[no-untyped-def]
+        return p * q
+
+    @BilinearForm
+    def push(p, v, w):  # type: ignore[no-untyped-def]
+        return -sum(grad(p)[k] * v[k] for k in range(3))
+
+    def near(ours: csr_matrix, theirs: csr_matrix) -> None:
+        assert abs(ours - theirs).max() <= 1e-12 * abs(theirs).max()
+
+    vector, scalar = _basis(mesh, True), _basis(mesh, False)
+    near(stiffness(mesh, lame, mu), elasticity.assemble(vector))
+    near(laplacian(mesh), diffusion.assemble(scalar))
+    near(consistent_mass(mesh), reaction.assemble(scalar))
+    near(gradient_load(mesh), push.assemble(scalar, vector))
+
+
+def test_rigid_motions_cost_no_energy() -> None:
+    mesh = ellipsoid(16.0)
+    matrix = stiffness(mesh, TISSUE.lame_kpa, TISSUE.shear_kpa)
+    modes = rigid_modes(mesh.points)
+    assert_allclose(matrix @ modes, 0, atol=1e-10 * abs(matrix).max() * np.abs(modes).max())
+    assert abs(matrix - matrix.T).max() < 1e-12 * abs(matrix).max()
+
+
+def test_patch_of_constant_strain_is_exact() -> None:
+    mesh = ellipsoid(14.0)
+    gradient = np.array([[0.02, -0.01, 0.03], [0.04, -0.05, 0.01], [0.0, 0.02, 0.03]])
+    exact = mesh.points @ gradient.T + [1, 2, 3]
+    outer = mesh.boundary.nodes
+    u = solid(mesh, TISSUE, outer).solve(np.zeros_like(exact), exact[outer])
+    assert_allclose(u, exact, atol=1e-10)
+    assert_allclose(
+        deformation_gradient(mesh, u), np.broadcast_to(np.eye(3) + gradient, (len(mesh.tets), 3, 3)), atol=1e-10
+    )
+
+
+def test_column_under_its_own_weight() -> None:
+    """nu = 0: u_z = -rho g (H z - z^2 / 2) / E, sign, value and order."""
+    tissue = Tissue(poisson=0.0)
+    height, density, errors, steps = 100.0, 300.0, [], []
+    for n in (1, 2, 4):
+        mesh = box((2 * n, 2 * n, 5 * n), (40.0, 40.0, height))
+        z = mesh.points[:, 2]
+        bottom = np.flatnonzero(z == 0)
+        down = np.array([0, 0, -GRAVITY_KPA_PER_MM * density])
+        u = solid(mesh, tissue, bottom).solve(body_load(mesh, down))
+        exact = -GRAVITY_KPA_PER_MM * density / tissue.young_kpa * (height * z - z**2 / 2)
+        difference = u[:, 2] - exact
+        errors.append(float(np.sqrt(difference @ (consistent_mass(mesh) @ difference))))
+        steps.append(height / n)
+        assert u[z == height, 2].max() < 0
+    assert order(steps, errors)[-1] > 1.7
+    assert u[z == height, 2].mean() == pytest.approx(-GRAVITY_KPA_PER_MM * density / 0.55 * height**2 / 2, rel=0.02)
+
+
+def test_manufactured_displacement_converges_with_second_order() -> None:
+    lame, mu = TISSUE.lame_kpa, TISSUE.shear_kpa
+    k = np.pi / 30.0
+
+    def exact(x: Array) -> Array:
+        s, c = np.sin(k * x), np.cos(k * x)
+        return np.stack([s[:, 0] * s[:, 1] * s[:, 2], 0 * s[:, 0], c[:, 0] * s[:, 1] * s[:, 2]], 1)
+
+    def force(x: Array) -> Array:
+        """-div sigma of `exact`: -mu laplace u - (lambda + mu) grad div u; div u = k (c s s + c s c)."""
+        s, c = np.sin(k * x), np.cos(k * x)
+        (s0, s1, s2), (c0, c1, c2) = s.T, c.T
+        grad_div = k**2 * np.stack([-s0 * s1 * (s2 + c2), c0 * c1 * (s2 + c2), c0 * s1 * (c2 - s2)], 1)
+        return 3 * mu * k**2 * exact(x) - (lame + mu) * grad_div
+
+    errors, steps = [], []
+    for n in (4, 8, 16):
+        mesh = box((n, n, n), (30.0, 30.0, 30.0))
+        outer = mesh.boundary.nodes
+        load = (consistent_mass(mesh) @ force(mesh.points)).reshape(-1, 3)
+        u = solid(mesh, TISSUE, outer).solve(load, exact(mesh.points)[outer])
+        difference = u - exact(mesh.points)
+        errors.append(float(np.sqrt(np.einsum("nd,nd->", difference, consistent_mass(mesh) @ difference))))
+        steps.append(30.0 / n)
+    assert order(steps, errors)[-1] > 1.8
+
+
+def test_uniform_eigenstrain_shrinks_without_stress() -> None:
+    mesh = ellipsoid(14.0)
+    strain = np.broadcast_to(-0.2 * np.eye(3), (len(mesh.tets), 3, 3))
+    mode = eigenstrain_mode(mesh, TISSUE, "all", strain, 1.0)
+    held = np.argsort(np.linalg.norm(mesh.points, axis=1))[:4]
+    u = solid(mesh, TISSUE, held).solve(mode.force, -0.2 * mesh.points[held])
+    assert_allclose(u, -0.2 * mesh.points, atol=1e-9)
+
+
+def test_eigenstress_is_in_balance() -> None:
+    mesh = ellipsoid(16.0)
+    stress = np.random.default_rng(0).normal(size=(len(mesh.tets), 3, 3))
+    stress = stress + stress.transpose(0, 2, 1)
+    force = eigenstress_load(mesh, stress)
+    assert_allclose(rigid_modes(mesh.points).T @ force.ravel(), 0, atol=1e-8)
+
+
+@pytest.mark.parametrize("poisson", [0.35, 0.45])
+def test_multigrid_agrees_with_the_factorization(poisson: float) -> None:
+    mesh = ellipsoid(11.0)
+    tissue = Tissue(poisson=poisson)
+    held = np.flatnonzero(mesh.points[:, 2] < -55)
+    free = np.setdiff1d(np.arange(len(mesh.points)), held)
+    rows = (free[:, None] * 3 + np.arange(3)).ravel()
+    matrix = stiffness(mesh, tissue.lame_kpa, tissue.shear_kpa)[rows][:, rows].tocsr()
+    right = np.random.default_rng(0).normal(size=len(rows))
+    direct = linear_solver(matrix, mesh.points[free])
+    iterative = linear_solver(matrix, mesh.points[free], limit=0)
+    assert isinstance(iterative, Multigrid)
+    exact = direct.solve(right)
+    assert_allclose(matrix @ exact, right, atol=1e-9)
+    assert_allclose(iterative.solve(right), exact, atol=1e-6 * np.abs(exact).max())
+    residuals = np.array(iterative.residuals)
+    assert (residuals[-1] / residuals[0]) ** (1 / (len(residuals) - 1)) < 0.5
+    many = direct.solve(np.stack([right, 2 * right], 1))
+    assert_allclose(many[:, 1], 2 * exact, rtol=1e-9, atol=1e-9 * np.abs(exact).max())
+
+
+def test_a_body_that_nothing_holds_is_refused() -> None:
+    with pytest.raises(ValueError, match="hold three"):
+        solid(ellipsoid(25.0), TISSUE, np.array([0]))
