@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.polynomial.legendre import leggauss
 
-from registration.bspline import along_axes
+from registration.banded import Banded, along_axes
 from registration.volume import Array, Grid
 
 
@@ -16,10 +16,10 @@ class BendingEnergy:
     """Mean over the control box of sum_ab |d2u / dx_a dx_b|^2, in 1/mm^2: c^T R c, R a sum of Kronecker products."""
 
     def __init__(self, control: Grid) -> None:
-        g0, g1, g2 = ([_gram(n, order) for n in control.shape] for order in range(3))
+        g0, g1, g2 = ([Banded(_gram(n, order)) for n in control.shape] for order in range(3))
         h = control.spacing
         cells = float(np.prod(np.array(control.shape) - 3))
-        self._terms: list[tuple[float, list[Array]]] = []
+        self._terms: list[tuple[float, list[Banded]]] = []
         for a in range(3):
             self._terms.append((1 / (h[a] ** 4 * cells), [g2[m] if m == a else g0[m] for m in range(3)]))
             b = (a + 1) % 3
@@ -35,7 +35,7 @@ class BendingEnergy:
 
     def diagonal(self) -> Array:
         """Diagonal of R, (ni, nj, nk)."""
-        return sum(w * np.einsum("i,j,k->ijk", *(np.diag(m) for m in matrices)) for w, matrices in self._terms)
+        return sum(w * np.einsum("i,j,k->ijk", *(m.diagonal() for m in matrices)) for w, matrices in self._terms)
 
 
 def _gram(n: int, order: int) -> Array:

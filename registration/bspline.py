@@ -12,6 +12,7 @@ import numpy as np
 from numba import njit, prange
 from scipy import sparse
 
+from registration.banded import Banded, along_axes
 from registration.field import DisplacementField
 from registration.volume import Array, Grid
 
@@ -84,10 +85,7 @@ def control_grid(grid: Grid, spacing_mm: float) -> Grid:
 
 
 class Lattice:
-    """Dense evaluation on a voxel grid, and its adjoint, as one small matrix per axis.
-
-    matrices: three (voxels, control points) float32.
-    """
+    """Dense evaluation on a voxel grid, and its adjoint, as one small matrix per axis."""
 
     def __init__(self, control: Grid, grid: Grid) -> None:
         a = control.ijk_from_ras @ grid.ras_from_ijk
@@ -96,36 +94,22 @@ class Lattice:
                 "the control grid's axes must be parallel to the voxel grid's; use displacement(points) instead"
             )
         self.control, self.grid = control, grid
-        self.matrices = [
-            basis_derivative(a[m, m] * np.arange(grid.shape[m]) + a[m, 3], control.shape[m], 0).astype(np.float32)
-            for m in range(3)
-        ]
+        dense = [basis_derivative(a[m, m] * np.arange(grid.shape[m]) + a[m, 3], control.shape[m], 0) for m in range(3)]
+        self._forward = [Banded(m) for m in dense]
+        self._adjoint = [Banded(m.T) for m in dense]
+        self._squared = [Banded((m * m).T) for m in dense]
 
     def forward(self, coefficients: Array) -> Array:
-        """Dense values (q, vi, vj, vk) float32 of coefficients (q, ni, nj, nk)."""
-        return along_axes(coefficients, self.matrices)
+        """Dense values (q, vi, vj, vk) of coefficients (q, ni, nj, nk)."""
+        return along_axes(coefficients, self._forward)
 
     def adjoint(self, dense: Array) -> Array:
         """Transpose of `forward`: (q, vi, vj, vk) -> (q, ni, nj, nk)."""
-        return along_axes(dense, [m.T for m in self.matrices])
+        return along_axes(dense, self._adjoint)
 
     def adjoint_squared(self, dense: Array) -> Array:
         """Adjoint with squared weights: the diagonal of forward^T diag(dense) forward."""
-        return along_axes(dense, [(m * m).T for m in self.matrices])
-
-
-def along_axes(values: Array, matrices: list[Array]) -> Array:
-    """Multiply axes 1, 2, 3 of (q, ni, nj, nk) by their matrices, cheapest order: axes that shrink most first."""
-    for axis in sorted(range(3), key=lambda m: matrices[m].shape[0] / matrices[m].shape[1]):
-        q, ni, nj, nk = values.shape
-        matrix = matrices[axis]
-        if axis == 0:
-            values = np.matmul(matrix, values.reshape(q, ni, nj * nk)).reshape(q, -1, nj, nk)
-        elif axis == 1:
-            values = np.matmul(matrix, values)
-        else:
-            values = (values.reshape(-1, nk) @ matrix.T).reshape(q, ni, nj, -1)
-    return values
+        return along_axes(dense, self._squared)
 
 
 def basis_derivative(x: Array, n: int, order: int) -> Array:

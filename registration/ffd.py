@@ -6,19 +6,19 @@ Ref: Rueckert 1999; Alvarez 2021, section 6.1.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from registration.bspline import BSplineField, control_grid
 from registration.field import DisplacementField, PointMap, sample_map
 from registration.metric import GlobalNcc, LocalNcc
-from registration.newton import Stop, gauss_newton
+from registration.newton import Descent, Stop, gauss_newton
 from registration.objective import Objective, Term
 from registration.penalties import Bending, Departure, Folding, Keypoints, Matches
-from registration.resample import coarsen, coarsen_mask
+from registration.pyramid import Images, Pyramid, cropped
 from registration.rigid import RigidTransform
-from registration.similarity import ImageTerm, Metric, Samples
+from registration.similarity import ImageTerm, Metric
 from registration.volume import Array, Grid, Mask, Volume
 
 Progress = Callable[[str, float], None]
@@ -33,7 +33,7 @@ class Weights:
 
     bending: float = 300.0
     prior: float = 0.0
-    keypoints: float = 0.01
+    keypoints: float = 0.02
     folding: float = 1.0
 
 
@@ -77,13 +77,24 @@ class CorrectedMap:
 @dataclass(frozen=True)
 class FfdFit:
     """moving_from_fixed: the map found; status: why the finest level stopped; history: objective per step and level;
-    min_det: least det of its gradient on the voxels compared; folded_share: share of voxels with det <= 0."""
+    min_det, folded_share: least det of the map's gradient on the finest voxels, and share of them with det <= 0;
+    shrunk: factor by which the correction had to be scaled so that nothing folds (1: not at all)."""
 
     moving_from_fixed: CorrectedMap
     status: Stop
     history: tuple[tuple[float, ...], ...]
     min_det: float
     folded_share: float
+    shrunk: float
+
+
+@dataclass(frozen=True)
+class _Setting:
+    """What stays the same over the levels."""
+
+    settings: FfdSettings
+    prior: PointMap
+    keypoints: Keypoints | None
 
 
 def register_ffd(
@@ -101,102 +112,91 @@ def register_ffd(
 
     fixed_mask: where images are compared (default everywhere); moving_mask: what the moving image sees (samples that
     map outside lose their weight); prior: any map of points, fixed to moving (default identity); the bending energy is
-    that of u alone, so it also holds the result to the prior.
+    that of u alone, so it also holds the result to the prior; keypoints: the coarsest level starts from their spline.
+    A barrier keeps det(dT/dx) > 0 at every level; if voxels fold all the same, the last level is repeated with a
+    stronger one, and at last u is scaled down until none does.
     """
-    prior = prior or RigidTransform.identity()
+    setting = _Setting(settings, prior or RigidTransform.identity(), keypoints)
     fixed_mask = fixed_mask or Mask(np.ones(fixed.hu.shape, dtype=bool), fixed.ras_from_ijk)
-    fixed, fixed_mask = _cropped(fixed, fixed_mask)
-    spline: BSplineField | None = None
-    histories, stop = [], Stop.ITERATIONS
-    pyramid = _Pyramid(fixed, fixed_mask, moving, moving_mask)
+    fixed, fixed_mask = cropped(fixed, fixed_mask)
+    pyramid = Pyramid(fixed, fixed_mask, moving, moving_mask)
+    spline, histories = _first(setting, fixed.grid), []
     for level in range(settings.levels):
+        if level > 0:
+            spline = spline.refined()
         spacing = settings.spacing_mm * 2 ** (settings.levels - 1 - level)
-        voxel = min(max(settings.voxel_mm, spacing / 8), 8.0)
         if progress is not None:
             progress(f"free-form deformation, {spacing:.0f} mm grid", level / settings.levels)
-        images = pyramid.at(voxel)
-        spline = _started(spline, fixed.grid, settings, level)
-        objective, image = _objective(images, settings, voxel, spline.control, prior, keypoints)
-        start = np.moveaxis(spline.coefficients, 3, 0)
-        descent = gauss_newton(objective, start, settings.steps, refresh=image.refresh)
+        images = pyramid.at(min(max(settings.voxel_mm, spacing / 8), 8.0))
+        spline, descent = _level(setting, images, spline)
         histories.append(descent.history)
-        stop = descent.stop
-        spline = BSplineField(np.moveaxis(descent.coefficients, 0, 3).astype(float), spline.ras_from_ijk)
-    assert spline is not None
-    result = CorrectedMap(prior, spline)
-    det = result.dense(images.samples.grid).jacobian_determinant().reshape(-1)[images.samples.index]
-    return FfdFit(result, stop, tuple(histories), float(det.min()), float(np.mean(det <= 0)))
+    for _ in range(2):
+        if _least_det(setting.prior, spline, images.samples.grid)[0] > 0:
+            break
+        setting = replace(setting, settings=_stiffer(setting.settings))
+        spline, descent = _level(setting, images, spline)
+        histories.append(descent.history)
+    spline, shrunk = _unfolded(setting.prior, spline, images.samples.grid)
+    least, share = _least_det(setting.prior, spline, images.samples.grid)
+    return FfdFit(CorrectedMap(setting.prior, spline), descent.stop, tuple(histories), least, share, shrunk)
 
 
-@dataclass(frozen=True)
-class _Images:
-    """One level: fixed values at the samples, the moving image, and where that sees."""
-
-    samples: Samples
-    fixed: Array
-    moving: Volume
-    seen: Volume | None
-
-
-class _Pyramid:
-    """Images coarsened to a voxel size."""
-
-    def __init__(self, fixed: Volume, fixed_mask: Mask, moving: Volume, moving_mask: Mask | None) -> None:
-        self._fixed, self._fixed_mask, self._moving, self._moving_mask = fixed, fixed_mask, moving, moving_mask
-
-    def at(self, voxel_mm: float) -> _Images:
-        fixed = coarsen(self._fixed, voxel_mm)
-        share = coarsen_mask(self._fixed_mask, voxel_mm)
-        index = np.flatnonzero(share.hu >= 0.5)
-        moving = coarsen(self._moving, voxel_mm)
-        seen = None if self._moving_mask is None else coarsen_mask(self._moving_mask, voxel_mm)
-        return _Images(Samples(fixed.grid, index), fixed.hu.reshape(-1)[index], moving, seen)
+def _first(setting: _Setting, grid: Grid) -> BSplineField:
+    """Coarsest spline: zero, or the one that fits the keypoints."""
+    settings = setting.settings
+    control = control_grid(grid, settings.spacing_mm * 2 ** (settings.levels - 1))
+    c = np.zeros((3, *control.shape), dtype=np.float32)
+    if setting.keypoints is not None:
+        matches = Matches(control, setting.keypoints, setting.prior, settings.weights.keypoints)
+        c = gauss_newton(Objective([matches, Bending(control, settings.weights.bending)]), c, 30).coefficients
+    return BSplineField(np.moveaxis(c, 0, 3).astype(float), control.ras_from_ijk)
 
 
-def _objective(
-    images: _Images,
-    settings: FfdSettings,
-    voxel_mm: float,
-    control: Grid,
-    prior: PointMap,
-    keypoints: Keypoints | None,
-) -> tuple[Objective, ImageTerm]:
-    weights = settings.weights
-    metric = _metric(images, settings, voxel_mm)
+def _level(setting: _Setting, images: Images, spline: BSplineField) -> tuple[BSplineField, Descent]:
+    """One level of Gauss-Newton steps."""
+    weights, control, prior = setting.settings.weights, spline.control, setting.prior
     image = ImageTerm(
-        images.samples, metric, images.moving, prior, control, images.seen, mass_preserving=settings.mass_preserving
+        images.samples,
+        _metric(images, setting.settings),
+        images.moving,
+        prior,
+        control,
+        images.seen,
+        mass_preserving=setting.settings.mass_preserving,
     )
     blocks, _ = images.samples.blocks()
     terms: list[Term] = [image, Bending(control, weights.bending), Folding(control, blocks, prior, weights.folding)]
     if weights.prior > 0:
         terms.append(Departure(control, blocks, weights.prior))
-    if keypoints is not None:
-        terms.append(Matches(control, keypoints, prior, weights.keypoints))
-    return Objective(terms), image
+    if setting.keypoints is not None:
+        terms.append(Matches(control, setting.keypoints, prior, weights.keypoints))
+    start = np.moveaxis(spline.coefficients, 3, 0)
+    descent = gauss_newton(Objective(terms), start, setting.settings.steps, refresh=image.refresh)
+    return BSplineField(np.moveaxis(descent.coefficients, 0, 3).astype(float), spline.ras_from_ijk), descent
 
 
-def _metric(images: _Images, settings: FfdSettings, voxel_mm: float) -> Metric:
+def _metric(images: Images, settings: FfdSettings) -> Metric:
     if settings.window_mm is None:
         return GlobalNcc(images.fixed)
-    radius = max(round(settings.window_mm / voxel_mm / 2), 2)
-    return LocalNcc(images.fixed, images.samples.index, images.samples.grid.shape, radius, settings.noise_hu)
+    grid = images.samples.grid
+    radius = max(round(settings.window_mm / float(grid.spacing.max()) / 2), 2)
+    return LocalNcc(images.fixed, images.samples.index, grid.shape, radius, settings.noise_hu)
 
 
-def _started(spline: BSplineField | None, grid: Grid, settings: FfdSettings, level: int) -> BSplineField:
-    """Zero at the first level, the refined result of the one before at the others."""
-    if spline is not None:
-        return spline.refined()
-    control = control_grid(grid, settings.spacing_mm * 2 ** (settings.levels - 1 - level))
-    return BSplineField(np.zeros((*control.shape, 3)), control.ras_from_ijk)
+def _stiffer(settings: FfdSettings) -> FfdSettings:
+    return replace(settings, weights=replace(settings.weights, folding=100 * settings.weights.folding))
 
 
-def _cropped(fixed: Volume, mask: Mask, margin_mm: float = 8.0) -> tuple[Volume, Mask]:
-    """Both restricted to the mask's bounding box and a margin."""
-    where = np.argwhere(mask.inside)
-    if len(where) == 0:
-        raise ValueError("the fixed mask is empty; nothing to register, check the segmentation")
-    margin = margin_mm / fixed.grid.spacing
-    box = fixed.grid.box(where.min(axis=0) - margin, where.max(axis=0) + 1 + margin)
-    lo = np.rint(fixed.grid.to_ijk(box.ras_from_ijk[:3, 3])).astype(int)
-    cut = tuple(slice(a, a + n) for a, n in zip(lo, box.shape, strict=True))
-    return Volume(fixed.hu[cut], box.ras_from_ijk), Mask(mask.inside[cut], box.ras_from_ijk)
+def _least_det(prior: PointMap, spline: BSplineField, grid: Grid) -> tuple[float, float]:
+    """Least det of the map's gradient on the voxels, and the share of voxels where it is not positive."""
+    det = CorrectedMap(prior, spline).dense(grid).jacobian_determinant()
+    return float(det.min()), float(np.mean(det <= 0))
+
+
+def _unfolded(prior: PointMap, spline: BSplineField, grid: Grid) -> tuple[BSplineField, float]:
+    """The spline scaled by the largest of 1, 0.9, 0.81, ... that folds no voxel."""
+    scale, c = 1.0, spline
+    while _least_det(prior, c, grid)[0] <= 0 and scale > 0.01:
+        scale *= 0.9
+        c = BSplineField(scale * spline.coefficients, spline.ras_from_ijk)
+    return c, scale

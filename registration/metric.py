@@ -1,6 +1,7 @@
 """Similarity of sampled images: value, slope and curvature with respect to the moving image's values.
 
-Each metric is a class whose `evaluate(m, w)` takes moving values m (n,) and weights w (n,) in [0, 1] at the samples.
+Each metric is a class whose `evaluate` takes moving values m (n,) and weights w (n,) in [0, 1] at the samples; without
+`with_slope` the derivatives stay empty.
 The slope is exact; the curvature is a non-negative diagonal that bounds the Gauss-Newton Hessian, which is all an
 optimizer needs.
 """
@@ -30,7 +31,7 @@ class GlobalNcc:
     def __init__(self, fixed: Array) -> None:
         self.fixed = fixed.astype(np.float64)
 
-    def evaluate(self, m: Array, w: Array) -> Similarity:
+    def evaluate(self, m: Array, w: Array, with_slope: bool = True) -> Similarity:
         """See the module's docstring."""
         m, w = m.astype(np.float64), w.astype(np.float64)
         f = self.fixed - np.average(self.fixed, weights=w)
@@ -38,6 +39,8 @@ class GlobalNcc:
         mm = max(float(np.dot(w * m, m)), 1e-12)
         ff = max(float(np.dot(w * f, f)), 1e-12)
         ncc = float(np.dot(w * f, m)) / np.sqrt(mm * ff)
+        if not with_slope:
+            return Similarity(1 - ncc, np.zeros(0), np.zeros(0))
         slope = -w * (f / np.sqrt(mm * ff) - ncc * m / mm)
         return Similarity(1 - ncc, slope.astype(np.float32), (w / mm).astype(np.float32))
 
@@ -53,16 +56,18 @@ class LocalNcc:
     def __init__(self, fixed: Array, index: Array, shape: tuple[int, int, int], radius: int, floor: float) -> None:
         self.index, self.shape, self.radius, self.floor = index, shape, radius, floor
         self.fixed = fixed - fixed.dtype.type(fixed.mean())
+        self._weights: Array | None = None
+        self._fixed_sums: list[Array] = []
 
-    def evaluate(self, m: Array, w: Array) -> Similarity:
+    def evaluate(self, m: Array, w: Array, with_slope: bool = True) -> Similarity:
         """See the module's docstring."""
         f = self.fixed
+        if self._weights is None or not np.array_equal(self._weights, w):
+            self._weights, w = w.copy(), w.astype(f.dtype)
+            self._fixed_sums = self._window_sums(w, w * f, w * f * f)
         w, m = w.astype(f.dtype), (m - m.mean()).astype(f.dtype)
-        sums = [self._gathered(v) for v in (w, w * f, w * m, w * f * f, w * m * m, w * f * m)]
-        return self._from_sums(f, m, w, sums)
-
-    def _from_sums(self, f: Array, m: Array, w: Array, sums: list[Array]) -> Similarity:
-        n, sf, sm, sff, smm, sfm = sums
+        n, sf, sff = self._fixed_sums
+        sm, smm, sfm = self._window_sums(w * m, w * m * m, w * f * m)
         n = np.maximum(n, n.dtype.type(1e-3))
         mean_f, mean_m = sf / n, sm / n
         noise = n * n.dtype.type(self.floor**2)
@@ -73,18 +78,23 @@ class LocalNcc:
         a = w / np.sqrt(vf * vm) / total
         cc = vfm * a
         b = cc / vm
-        slope = -w * (f * self._gathered(a) - m * self._gathered(b) - self._gathered(a * mean_f - b * mean_m))
-        curvature = w * self._gathered(w / vm / total)
-        return Similarity(1 - float(cc.sum(dtype=np.float64)), slope, curvature)
+        value = 1 - float(cc.sum(dtype=np.float64))
+        if not with_slope:
+            return Similarity(value, np.zeros(0), np.zeros(0))
+        sa, sb, sab, sh = self._window_sums(a, b, a * mean_f - b * mean_m, w / vm / total)
+        return Similarity(value, -w * (f * sa - m * sb - sab), w * sh)
 
-    def _gathered(self, values: Array) -> Array:
-        dense = np.zeros(self.shape, dtype=values.dtype)
-        dense.reshape(-1)[self.index] = values
-        return box_sum(dense, self.radius).reshape(-1)[self.index]
+    def _window_sums(self, *values: Array) -> list[Array]:
+        """Sums over each sample's window of values given at the samples, (n,) each."""
+        dense = np.zeros((len(values), int(np.prod(self.shape))), dtype=values[0].dtype)
+        for row, v in zip(dense, values, strict=True):
+            row[self.index] = v
+        sums = box_sums(dense.reshape(-1, *self.shape), self.radius)
+        return list(sums.reshape(len(values), -1)[:, self.index])
 
 
-def box_sum(values: Array, radius: int) -> Array:
-    """Sum over the (2 radius + 1)^3 voxels around each voxel of (ni, nj, nk); outside counts as zero."""
+def box_sums(values: Array, radius: int) -> Array:
+    """Sums over the (2 radius + 1)^3 voxels around each voxel of (q, ni, nj, nk); outside counts as zero."""
     out = np.empty_like(values)
     _sum_in_planes(values, radius, out)
     _sum_across_planes(out, radius)
@@ -93,18 +103,18 @@ def box_sum(values: Array, radius: int) -> Array:
 
 @njit(cache=True, parallel=True, fastmath=True)
 def _sum_in_planes(values, radius, out):
-    ni, nj, nk = values.shape
-    for i in prange(ni):
-        rows = np.empty((nj, nk), dtype=values.dtype)
+    nq, ni, nj, nk = values.shape
+    for t in prange(nq * ni):
+        plane, rows = values[t // ni, t % ni], np.empty((nj, nk), dtype=values.dtype)
         for j in range(nj):
             run = 0.0
             for k in range(min(radius, nk)):
-                run += values[i, j, k]
+                run += plane[j, k]
             for k in range(nk):
                 if k + radius < nk:
-                    run += values[i, j, k + radius]
+                    run += plane[j, k + radius]
                 if k - radius - 1 >= 0:
-                    run -= values[i, j, k - radius - 1]
+                    run -= plane[j, k - radius - 1]
                 rows[j, k] = run
         run_j = np.zeros(nk)
         for j in range(min(radius, nj)):
@@ -114,14 +124,15 @@ def _sum_in_planes(values, radius, out):
                 run_j += rows[j + radius]
             if j - radius - 1 >= 0:
                 run_j -= rows[j - radius - 1]
-            out[i, j] = run_j
+            out[t // ni, t % ni, j] = run_j
 
 
 @njit(cache=True, parallel=True, fastmath=True)
 def _sum_across_planes(values, radius):
-    ni, nj, nk = values.shape
-    for j in prange(nj):
-        column = values[:, j].copy()
+    nq, ni, nj, nk = values.shape
+    for t in prange(nq * nj):
+        q, j = t // nj, t % nj
+        column = values[q, :, j].copy()
         run = np.zeros(nk)
         for i in range(min(radius, ni)):
             run += column[i]
@@ -130,4 +141,4 @@ def _sum_across_planes(values, radius):
                 run += column[i + radius]
             if i - radius - 1 >= 0:
                 run -= column[i - radius - 1]
-            values[i, j] = run
+            values[q, i, j] = run

@@ -42,7 +42,7 @@ def gauss_newton(
 
     Stops when a step lowers the objective by less than `tolerance` of itself, moves no control point by more than
     `step_mm`, or after `steps` steps. Each direction solves H d = -g by Jacobi-preconditioned conjugate gradients to a
-    relative residual of 0.02 or 60 iterations; the step is halved until Armijo's condition (1e-4) holds. refresh:
+    relative residual of 0.1 or 40 iterations; the step is halved until Armijo's condition (1e-4) holds. refresh:
     called with c before each step, to reset what the objective holds fixed during a step.
     """
     c: Array = start.astype(np.float32)
@@ -70,7 +70,7 @@ def gauss_newton(
     return Descent(c, Stop.ITERATIONS, (*history, new))
 
 
-def conjugate_gradients(model: Model, tolerance: float = 0.02, iterations: int = 60) -> Array:
+def conjugate_gradients(model: Model, tolerance: float = 0.1, iterations: int = 40) -> Array:
     """Solve H d = -gradient to the relative residual `tolerance`, Jacobi-preconditioned, in float32."""
     right = -model.gradient.astype(np.float32)
     diagonal = model.diagonal

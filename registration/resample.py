@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from registration.bspline import along_axes
+from registration.banded import Banded, along_axes
 from registration.field import DisplacementField, PointMap, slabs
 from registration.interpolate import interpolate
 from registration.volume import Array, Grid, Mask, Volume
@@ -56,7 +56,7 @@ def _filtered(volume: Volume, grid: Grid, sigma_mm: Array) -> Volume:
             weights = np.exp(-(distance**2) / (2 * sigma**2)) * (np.abs(distance) <= 4 * sigma + 1)
         else:
             weights = np.maximum(1 - np.abs(distance), 0)
-        matrices.append((weights / weights.sum(axis=1, keepdims=True)).astype(np.float32))
+        matrices.append(Banded(weights / weights.sum(axis=1, keepdims=True)))
     voxels = np.ascontiguousarray(volume.hu, dtype=np.float32)
     return Volume(along_axes(voxels[None], matrices)[0], grid.ras_from_ijk)
 

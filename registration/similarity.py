@@ -22,7 +22,7 @@ BLOCK = 2
 class Metric(Protocol):
     """A dissimilarity of the samples; see `registration.metric`."""
 
-    def evaluate(self, m: Array, w: Array) -> Similarity: ...
+    def evaluate(self, m: Array, w: Array, with_slope: bool = True) -> Similarity: ...
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ class ImageTerm:
         m, _ = self._warped(self._displacement(c))
         if self._stretch is not None:
             m = (m + 1000) * self._det(c)[0] - 1000
-        return self._metric.evaluate(m, self.share).value
+        return self._metric.evaluate(m, self.share, with_slope=False).value
 
     def model(self, c: Array) -> Model:
         """D, its exact gradient, and a Gauss-Newton Hessian that leaves out how det(dT/dx) changes.

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from registration.bspline import along_axes, basis_derivative
+from registration.banded import Banded, along_axes
+from registration.bspline import basis_derivative
 from registration.field import PointMap
 from registration.volume import Array, Grid
 
@@ -26,7 +27,9 @@ class Stretch:
         x = [a[m, m] * np.arange(blocks.shape[m]) + a[m, 3] for m in range(3)]
         plain = [basis_derivative(x[m], control.shape[m], 0) for m in range(3)]
         slope = [basis_derivative(x[m], control.shape[m], 1) for m in range(3)]
-        self._matrices = [[slope[m] if m == b else plain[m] for m in range(3)] for b in range(3)]
+        chosen = [[slope[m] if m == b else plain[m] for m in range(3)] for b in range(3)]
+        self._matrices = [[Banded(m) for m in row] for row in chosen]
+        self._transposed = [[Banded(m.T) for m in row] for row in chosen]
         self._ijk_from_ras = control.ijk_from_ras[:3, :3]
         points = blocks.points().reshape(-1, 3)
         rows = [(prior(points + 0.5 * e) - prior(points - 0.5 * e)).T for e in np.eye(3)]
@@ -44,7 +47,7 @@ class Stretch:
     def adjoint(self, p: Array) -> Array:
         """Transpose of `change`: (3, 3, bi, bj, bk) -> (3, ni, nj, nk)."""
         along = np.einsum("abijk,mb->amijk", p, self._ijk_from_ras, optimize=True)
-        return np.sum([along_axes(along[:, m], [k.T for k in self._matrices[m]]) for m in range(3)], axis=0)
+        return np.sum([along_axes(along[:, m], self._transposed[m]) for m in range(3)], axis=0)
 
 
 def determinant(f: Array) -> Array:

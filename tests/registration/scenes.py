@@ -12,7 +12,7 @@ Pattern = Callable[[Array], Array]
 
 
 def make_pattern(seed: int = 0, waves: int = 60, shortest_mm: float = 14.0) -> Pattern:
-    """HU at any points (n, 3): a sum of cosines of random directions, wavelengths from `shortest_mm` to 6 times that."""
+    """HU at any points (n, 3): a sum of cosines in random directions, wavelengths `shortest_mm` to 6 times that."""
     rng = np.random.default_rng(seed)
     k = rng.normal(size=(waves, 3))
     k *= (2 * np.pi / (shortest_mm * rng.uniform(1, 6, waves)) / np.linalg.norm(k, axis=1))[:, None]

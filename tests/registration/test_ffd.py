@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -20,7 +22,7 @@ GRID = oriented("LPS", (40, 38, 36), 2.5, CENTRE)
 WIDE = oriented("RAS", (64, 64, 64), 2.5, CENTRE)
 PATTERN = make_pattern(4)
 INNER = GRID.to_ras(np.random.default_rng(2).uniform(6, 29, (300, 3)))
-COARSE = FfdSettings(levels=3, voxel_mm=2.5)
+COARSE = FfdSettings(levels=3, voxel_mm=2.5, weights=Weights(bending=20.0))
 
 
 def wave(points: Array) -> Array:
@@ -37,8 +39,8 @@ def error(got: Array, expected: Array) -> Array:
 @pytest.mark.parametrize("window_mm", [14.0, None])
 def test_a_known_map_comes_back(window_mm: float | None) -> None:
     fixed, moving = image_of(lambda p: PATTERN(wave(p)), GRID), image_of(PATTERN, WIDE)
-    fit = register_ffd(fixed, moving, FfdSettings(levels=3, voxel_mm=2.5, window_mm=window_mm))
-    assert error(INNER, wave(INNER)).mean() > 3
+    fit = register_ffd(fixed, moving, replace(COARSE, window_mm=window_mm))
+    assert error(INNER, wave(INNER)).mean() > 2.5
     assert error(fit.moving_from_fixed(INNER), wave(INNER)).mean() < 0.15
     assert error(fit.moving_from_fixed(INNER), wave(INNER)).max() < 0.8
     assert fit.folded_share == 0
@@ -71,7 +73,7 @@ def test_mass_preservation_reads_density_as_volume() -> None:
 
     sponge = image_of(lambda p: PATTERN(p) * 0.3 - 700, WIDE)
     fixed = image_of(lambda p: (PATTERN(mapped(p)) * 0.3 + 300) / squeeze - 1000, GRID)
-    settings = FfdSettings(levels=3, voxel_mm=2.5, window_mm=None, mass_preserving=True)
+    settings = replace(COARSE, window_mm=None, mass_preserving=True)
     fit = register_ffd(fixed, sponge, settings)
     assert error(fit.moving_from_fixed(INNER), mapped(INNER)).mean() < 0.25
     det = fit.moving_from_fixed.dense(GRID).jacobian_determinant()[8:-8, 8:-8, 8:-8]
@@ -91,12 +93,12 @@ def test_samples_that_leave_the_moving_view_do_not_pull() -> None:
 
 def test_keypoints_lead_beyond_the_capture_range() -> None:
     stripes = make_pattern(6, waves=80, shortest_mm=4.0)
-    fine = oriented("RAS", (110, 110, 110), 1.25, CENTRE)
-    grid = oriented("LPS", (48, 46, 44), 1.25, CENTRE)
+    fine = oriented("RAS", (80, 90, 90), 1.25, CENTRE)
+    grid = oriented("LPS", (34, 32, 30), 1.25, CENTRE)
     push = np.array([0.0, 16.0, -12.0])
     fixed = image_of(lambda p: stripes(p + push), grid)
     moving = image_of(stripes, fine)
-    points = grid.to_ras(np.random.default_rng(1).uniform(4, 40, (60, 3)))
+    points = grid.to_ras(np.random.default_rng(1).uniform(3, 27, (60, 3)))
     matches = Keypoints(points, points + push, np.ones(60))
     matches.moving[:6] += 40.0
     settings = FfdSettings(levels=1, voxel_mm=1.25, window_mm=8.0)

@@ -68,7 +68,7 @@ def test_a_field_and_its_inverse_compose_to_nothing(height_mm: float) -> None:
 def test_composition_applies_the_inner_map_first() -> None:
     turn = RigidTransform.about(CENTRE, np.array([0.0, 0.0, np.pi / 2]), np.zeros(3))
     shift = sample_map(lambda x: x + np.array([4.0, 0.0, 0.0]), GRID)
-    assert_allclose(compose(turn, shift)(CENTRE[None]), [CENTRE + [0.0, 4.0, 0.0]], atol=1e-4)
+    assert_allclose(compose(turn, shift)(CENTRE[None]), CENTRE[None] + np.array([0.0, 4.0, 0.0]), atol=1e-4)
 
 
 def test_the_determinant_of_an_affine_field() -> None:

@@ -60,7 +60,9 @@ def test_a_field_on_the_same_grid_and_the_map_it_samples_agree() -> None:
 
 def test_outside_takes_the_fill_value() -> None:
     grid = Grid((4, 4, 4), np.eye(4))
-    seen = resample(Volume(np.zeros((4, 4, 4), np.float32), np.eye(4)), grid, lambda p: p + [2.5, 0, 0], fill=-77)
+    seen = resample(
+        Volume(np.zeros((4, 4, 4), np.float32), np.eye(4)), grid, lambda p: p + np.array([2.5, 0, 0]), fill=-77
+    )
     assert_allclose(seen.hu[0], 0)
     assert_allclose(seen.hu[1:], -77)
 
