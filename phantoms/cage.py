@@ -48,7 +48,8 @@ class CageMotion:
         wall = smoothstep(self.side * x, 45, 120) * smoothstep(z, -260, -120)
         lateral = lateral - self.side * self.squeeze * wall * (1 - 0.6 * smoothstep(z, 20, 100))
         forward: Array = -0.8 * self.squeeze * smoothstep(y, 0, 80) + 0.25 * self.shift * middle * ahead
-        free = 1 - np.exp(-(((x / 42) ** 2 + ((y - spine_y(b, z) + 12) / 48) ** 2) ** 2))
+        from_spine = np.hypot(np.maximum(np.abs(x) - 24, 0), np.maximum(np.abs(y - spine_y(b, z) + 18) - 36, 0))
+        free = smoothstep(from_spine, 0, 45)
         return np.stack([lateral * free, forward * free, up * free], axis=1)
 
     def inverse(self, points: Array, tolerance_mm: float = 1e-3) -> Array:
