@@ -16,6 +16,7 @@ from vatsloc.imaging.lattice import close, dilate, erode, largest, on_grid, work
 Side = Literal["left", "right"]
 
 AIRY_HU = -400.0
+ROOM_AIR_HU = -930.0
 SPACING_MM = 2.0
 LEAST_LUNG_ML = 250.0
 
@@ -77,14 +78,22 @@ def _other(side: str) -> str:
 
 
 def _air_in_body(work: Volume) -> Array:
-    """Air-like voxels that no axial slice joins to the outside."""
+    """Air-like voxels that no axial slice joins to the outside.
+
+    Where a CT was cropped through a lung, what touches its side face is inside unless it is as dark as room air.
+    """
     airy = work.hu < AIRY_HU
     in_slice = np.zeros((3, 3, 3), dtype=bool)
     in_slice[:, :, 1] = ndimage.generate_binary_structure(2, 1)
     labels, count = ndimage.label(airy, in_slice)
     outside = np.zeros(count + 1, dtype=bool)
-    for face in (labels[0], labels[-1], labels[:, 0], labels[:, -1]):
+    for face in (labels[:, 0], labels[:, -1]):
         outside[np.unique(face)] = True
+    pieces = np.bincount(labels.ravel(), minlength=count + 1)
+    mean = np.bincount(labels.ravel(), work.hu.ravel(), minlength=count + 1) / np.maximum(pieces, 1)
+    for face in (labels[0], labels[-1]):
+        at_side = np.unique(face)
+        outside[at_side[mean[at_side] < ROOM_AIR_HU]] = True
     outside[0] = True
     return ~outside[labels]
 
