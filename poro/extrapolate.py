@@ -12,10 +12,9 @@ import numpy as np
 from scipy.sparse import coo_matrix
 
 from poro.assembly import deformation_gradient
-from poro.mesh.locate import locate
 from poro.mesh.tetmesh import Array, TetMesh
 from poro.solid import solid
-from poro.springs import point_operator, springs
+from poro.springs import springs
 from poro.tissue import Tissue
 
 
@@ -89,61 +88,3 @@ def _continue(mesh: TetMesh, nodes: Array, displacement: Array, tissue: Tissue, 
     operator = coo_matrix((np.ones(k), (np.arange(k), nodes)), shape=(k, len(mesh.points))).tocsr()
     matrix, force = springs(operator, stiffness, displacement)
     return solid(mesh, tissue, np.zeros(0, int), matrix).solve(force)
-
-
-@dataclass(frozen=True)
-class Pull:
-    """Springs at points of a deformed lung. points: (q, 3) mm; offset: (q, 3) mm; sigma_mm: (q,) uncertainty.
-
-    normals: (q, 3) unit vectors along which alone the spring acts, or zero rows for all directions.
-    """
-
-    points: Array
-    offset: Array
-    sigma_mm: Array
-    normals: Array
-
-
-@dataclass(frozen=True)
-class Correction:
-    """Elastic displacement on top of a solved state. u: (n, 3) mm; det_f: (m,) of the correction alone; misfit_mm:
-    (q,).
-    """
-
-    u: Array
-    det_f: Array
-    misfit_mm: Array
-    influence: Array
-
-
-def correct(
-    mesh: TetMesh, u: Array, tissue: Tissue, pull: Pull, model_sigma: float = 0.05, robust: float = 3.0, rounds: int = 4
-) -> Correction:
-    """Least elastic energy that brings a solved state (n, 3) nearer to matched points, outliers losing influence
-    (Cauchy).
-
-    model_sigma: strain the solved state may be wrong by over one tenth of a litre; it sets how stiff the tissue is
-    against millimetres of misfit. The elasticity starts from the deformed shape, so the correction is small even
-    where u is large.
-    """
-    deformed = TetMesh(mesh.points + u, mesh.tets)
-    where = locate(deformed, pull.points)
-    operator = point_operator(where, len(u))
-    axial = np.linalg.norm(pull.normals, axis=1) > 0.5
-    shape = np.where(axial[:, None, None], pull.normals[:, :, None] * pull.normals[:, None, :], np.eye(3))
-    # Energy per unit variance: a 0.1 l region strained by model_sigma weighs as much as one standard deviation of
-    # misfit.
-    unit = tissue.young_kpa * 1e5 * model_sigma**2
-    influence = where.inside / (1 + np.minimum(where.distance, 1e3))
-    field = np.zeros_like(u)
-    for _ in range(rounds):
-        stiffness = (unit * influence / pull.sigma_mm**2)[:, None, None] * shape
-        anchor = 1e-9 * tissue.young_kpa * np.cbrt(deformed.node_volumes)
-        matrix, force = springs(operator, stiffness, pull.offset)
-        every = coo_matrix((np.repeat(anchor, 3), (np.arange(3 * len(u)),) * 2)).tocsr()
-        field = solid(deformed, tissue, np.zeros(0, int), (matrix + every).tocsr()).solve(force)
-        rest = np.einsum("qij,qj->qi", shape, pull.offset - operator @ field)
-        misfit = np.linalg.norm(rest, axis=1)
-        influence = where.inside / (1 + (misfit / (robust * pull.sigma_mm)) ** 2)
-    det_f = np.linalg.det(deformation_gradient(deformed, field))
-    return Correction(field, det_f, misfit, influence)

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from poro.mesh.locate import interpolate, locate
 from poro.mesh.tetmesh import Array
@@ -22,7 +21,7 @@ from poro.model import (
     sensitivity,
     solve,
 )
-from poro.observations import Observer, Residuals, Target
+from poro.observations import Observer, Residuals, Target, independence
 
 CHI2_95_3D = 7.814728  # 95 % quantile of chi-squared with three degrees of freedom
 
@@ -149,7 +148,7 @@ def fit(
     if not target.weights.any() and not target.keypoint_weights.any():
         raise ValueError("target holds no point of positive weight; give surface points or matched inner points")
     observer = Observer(system.mesh, target, settings.plain)
-    problem = _Problem(system, observer, settings, _independence(target, settings.correlation_mm))
+    problem = _Problem(system, observer, settings, _worth(target, settings.correlation_mm))
     runs = []
     for number, start in enumerate(settings.starts):
         if progress:
@@ -258,16 +257,9 @@ def _bounded_step(
     return step
 
 
-def _independence(target: Target, correlation_mm: float) -> Array:
-    """Share (t + k,) of an independent observation that every point is worth, by its neighbours within the
-    correlation length.
-    """
-    points = target.points
-    crowd = np.ones(len(points))
-    if len(points) and correlation_mm > 0:
-        tree = cKDTree(points)
-        crowd = tree.query_ball_point(points, correlation_mm / 2, return_length=True).astype(float)
-    return np.concatenate([1 / crowd, np.ones(len(target.inflated))])
+def _worth(target: Target, correlation_mm: float) -> Array:
+    """Independent observations (t + k,) that every surface and inner point is worth."""
+    return np.concatenate([independence(target.points, correlation_mm), np.ones(len(target.inflated))])
 
 
 def _covariance(problem: _Problem, rows: Residuals, du: Array, theta: Array) -> Array:

@@ -139,3 +139,10 @@ def _widen(rows: Residuals, corners: int) -> Residuals:
     nodes = np.pad(rows.nodes, ((0, 0), (0, missing)))
     share = np.pad(rows.share, ((0, 0), (0, missing), (0, 0)))
     return Residuals(rows.value, nodes, share, rows.group, rows.weight, rows.surface)
+
+
+def independence(points: Array, correlation_mm: float) -> Array:
+    """Share (t,) of an independent observation that every point (t, 3) is worth: one over its neighbours nearby."""
+    if not len(points) or correlation_mm <= 0:
+        return np.ones(len(points))
+    return 1 / cKDTree(points).query_ball_point(points, correlation_mm / 2, return_length=True)

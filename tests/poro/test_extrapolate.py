@@ -9,8 +9,7 @@ import pytest
 from numpy.testing import assert_allclose
 from shapes import ellipsoid
 
-from poro.extrapolate import ExtrapolationStatus, Pull, correct, extrapolate
-from poro.mesh import interpolate, locate
+from poro.extrapolate import ExtrapolationStatus, extrapolate
 from poro.tissue import Tissue
 
 TISSUE = Tissue()
@@ -80,38 +79,3 @@ def test_values_that_would_fold_the_mesh_are_released() -> None:
 def test_too_few_nodes_are_refused() -> None:
     with pytest.raises(ValueError, match="three or more"):
         extrapolate(ellipsoid(25.0), np.array([0, 1]), np.zeros((2, 3)), TISSUE)
-
-
-def test_correction_recovers_a_smooth_residual_and_ignores_outliers() -> None:
-    mesh = ellipsoid(10.0)
-    rng = np.random.default_rng(4)
-    u = mesh.points @ GRADIENT.T
-
-    def hidden(x: np.ndarray) -> np.ndarray:
-        return 3 * np.stack([np.sin(x[:, 1] / 40), np.cos(x[:, 2] / 50), x[:, 0] / 40], 1)
-
-    inside = rng.uniform(-25, 25, (120, 3))
-    where = locate(mesh, inside)
-    now = inside + interpolate(where, u)
-    wanted = hidden(inside)
-    wanted[:10] += rng.normal(size=(10, 3)) * 30
-    pull = Pull(now, wanted, np.full(120, 0.5), np.zeros((120, 3)))
-    found = correct(mesh, u, TISSUE, pull)
-    fresh = rng.uniform(-25, 25, (200, 3))
-    left = interpolate(locate(mesh, fresh), found.u) - hidden(fresh)
-    assert np.linalg.norm(left, axis=1).mean() < 0.25 * np.linalg.norm(hidden(fresh), axis=1).mean()
-    assert (found.influence[:10] < 0.2).all()
-    assert (found.influence[10:] > 0.5).mean() > 0.9
-    assert found.det_f.min() > 0.2
-
-
-def test_normal_springs_leave_sliding_free() -> None:
-    mesh = ellipsoid(12.0)
-    s = mesh.boundary
-    pull = Pull(
-        s.points, np.broadcast_to([0.0, 4.0, 0.0], s.points.shape).copy(), np.full(len(s.points), 1.0), s.node_normals
-    )
-    found = correct(mesh, np.zeros_like(mesh.points), TISSUE, pull, robust=np.inf, rounds=1)
-    assert_allclose(found.u.mean(axis=0), [0, 4, 0], atol=0.2)
-    along = np.einsum("nd,nd->n", found.u[s.nodes] - [0, 4, 0], s.node_normals)
-    assert np.abs(along).max() < 0.4

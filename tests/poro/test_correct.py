@@ -1,0 +1,66 @@
+"""The correction finds what a model left, ignores outliers, and leaves sliding along the wall free."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.testing import assert_allclose
+from shapes import ellipsoid
+
+from poro.correct import Pull, correct, pull_of
+from poro.mesh import interpolate, locate
+from poro.observations import Target
+from poro.tissue import Tissue
+
+TISSUE = Tissue()
+GRADIENT = np.array([[-0.1, 0.02, 0.0], [0.03, -0.05, 0.04], [0.0, -0.02, 0.08]])
+
+
+def test_correction_recovers_a_smooth_residual_and_ignores_outliers() -> None:
+    mesh = ellipsoid(10.0)
+    rng = np.random.default_rng(4)
+    u = mesh.points @ GRADIENT.T
+
+    def hidden(x: np.ndarray) -> np.ndarray:
+        return 3 * np.stack([np.sin(x[:, 1] / 40), np.cos(x[:, 2] / 50), x[:, 0] / 40], 1)
+
+    inside = rng.uniform(-25, 25, (120, 3))
+    wanted = hidden(inside)
+    wanted[:10] += rng.normal(size=(10, 3)) * 30
+    pull = Pull(inside, wanted, np.full(120, 0.5), np.zeros((120, 3)))
+    found = correct(mesh, u, TISSUE, pull)
+    fresh = rng.uniform(-25, 25, (200, 3))
+    left = interpolate(locate(mesh, fresh), found.u) - hidden(fresh)
+    assert np.linalg.norm(left, axis=1).mean() < 0.25 * np.linalg.norm(hidden(fresh), axis=1).mean()
+    assert (found.influence[:10] < 0.2).all()
+    assert (found.influence[10:] > 0.5).mean() > 0.9
+    assert found.det_f.min() > 0.5
+
+
+def test_normal_springs_leave_sliding_free() -> None:
+    mesh = ellipsoid(12.0)
+    s = mesh.boundary
+    pull = Pull(
+        s.points, np.broadcast_to([0.0, 4.0, 0.0], s.points.shape).copy(), np.full(len(s.points), 1.0), s.node_normals
+    )
+    found = correct(mesh, np.zeros_like(mesh.points), TISSUE, pull, robust=np.inf, rounds=1)
+    assert_allclose(found.u.mean(axis=0), [0, 4, 0], atol=0.2)
+    along = np.einsum("nd,nd->n", found.u[s.nodes] - [0, 4, 0], s.node_normals)
+    assert np.abs(along).max() < 0.4
+
+
+def test_a_moved_target_pulls_the_lung_onto_itself() -> None:
+    mesh = ellipsoid(10.0)
+    s = mesh.boundary
+    u = mesh.points @ GRADIENT.T
+    shift = np.array([1.5, -1.0, 2.0])
+    x = np.random.default_rng(8).uniform(-22, 22, (30, 3))
+    moved = s.moved(s.points + u[s.nodes] + shift)
+    target = Target(
+        moved.points, moved.node_normals, np.ones(len(s.points)), x, x + x @ GRADIENT.T + shift, np.ones(30)
+    )
+    pull = pull_of(target, mesh, u)
+    assert_allclose(pull.offset[-30:], np.broadcast_to(shift, (30, 3)), atol=1e-9)
+    found = correct(mesh, u, TISSUE, pull)
+    left = np.linalg.norm(found.u - shift, axis=1)
+    assert left.mean() < 0.15
+    assert left.max() < 0.8
