@@ -25,7 +25,7 @@ class Scanner:
     blur: float = 0.9
     cupping: float = 0.06
     rim: float = 0.10
-    noise: float = 22.0
+    noise: float = 21.0
     end: float = 12.0
 
 
@@ -59,9 +59,9 @@ def expose(clean: Volume, scanner: Scanner, rng: np.random.Generator) -> Volume:
 
 
 def _grain(grid: Grid, rng: np.random.Generator) -> Array:
-    """Noise of unit variance, finer across the slices than along, with a weak coarse part."""
+    """Noise of unit variance, as grainy as filtered back-projection: wider in a slice than along, weakly coarse."""
     white = rng.standard_normal(grid.shape, dtype=np.float32)
-    fine = ndimage.gaussian_filter(white, 0.75 / grid.spacing, truncate=3)
+    fine = ndimage.gaussian_filter(white, np.array([1.1, 1.1, 0.5]) / grid.spacing, truncate=3)
     small = rng.standard_normal([n // 6 + 2 for n in grid.shape], dtype=np.float32)
     coarse = refine(small, 6, grid.shape)
     return 0.95 * fine / fine.std() + 0.3 * coarse / coarse.std()
