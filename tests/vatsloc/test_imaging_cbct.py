@@ -86,3 +86,13 @@ def test_image_without_bone_has_no_spine() -> None:
     hu = np.where(scene.volume.hu > 150, np.float32(40), scene.volume.hu)
     with pytest.raises(InputRefused, match="No spine found"):
         segment_spine(Volume(hu, scene.volume.ras_from_ijk))
+
+
+def test_a_bright_sternum_is_not_taken_for_the_spine() -> None:
+    scene = known.thorax()
+    x = scene.volume.grid.points()
+    plate = (np.abs(x[..., 0]) < 20.0) & (x[..., 1] > 72.0) & (x[..., 1] < 84.0)
+    hu = np.where(plate, np.float32(900), scene.volume.hu)
+    done = prepare_cbct(known.cone_beam(Volume(hu, scene.volume.ras_from_ijk), (25.0, 10.0), 105.0))
+    spine = segment_spine(done.volume, done.field.usable)
+    assert_allclose(spine.centres_ras[:, 1], -58.0, atol=10.0)

@@ -15,7 +15,7 @@ SPACING_MM = 2.5
 BODY_RADIUS_MM = 16.0
 BENDING_MM_PER_MM = 0.6
 REACH_R_MM = 40.0
-REACH_FRONT_MM = 26.0
+REACH_FRONT_MM = 36.0
 REACH_BACK_MM = 48.0
 LEAST_LENGTH_MM = 60.0
 
@@ -75,14 +75,14 @@ def segment_spine(image: Volume, usable: Mask | None = None, rim_mm: float = 3.0
 def bone_threshold(hu: Array) -> float:
     """HU above which tissue is bone, set from the image's own soft-tissue peak and its brightest tail.
 
-    42 % of the way from the peak between -200 and 200 HU to the 99.8th percentile, at least 100 HU above the peak:
+    42 % of the way from the peak between -200 and 200 HU to the 99.8th percentile, 100 to 250 HU above it:
     cupping and a wrong scale move both ends alike.
     """
     counts, edges = np.histogram(hu, bins=np.arange(-200.0, 201.0, 10.0))
     smooth = ndimage.gaussian_filter1d(counts.astype(float), 2.0)
     soft = float(edges[int(smooth.argmax())] + 5.0)
     dense = float(np.percentile(hu, 99.8))
-    return max(soft + 0.42 * (dense - soft), soft + 100.0)
+    return soft + float(np.clip(0.42 * (dense - soft), 100.0, 250.0))
 
 
 def _column(work: Volume, excess: Array, seen: Array, slices: Array) -> Array:
@@ -94,9 +94,9 @@ def _column(work: Volume, excess: Array, seen: Array, slices: Array) -> Array:
     sigma = BODY_RADIUS_MM / 2 / spacing
     density = ndimage.gaussian_filter(excess, (sigma[0], sigma[1], 2 * sigma[2]))[:, :, slices]
     weight = ndimage.gaussian_filter(seen.astype(np.float32), (sigma[0], sigma[1], 0))[:, :, slices]
-    density = density / np.maximum(weight, 0.5)
+    density = density / np.maximum(weight, 0.8)
     density /= max(float(density.max()), 1e-6)
-    density += _posterior(work)[:, :, slices]
+    density = density - _too_far_front(work)[:, :, slices]
     reach = np.maximum(np.rint(BENDING_MM_PER_MM * spacing[2] / spacing[:2]), 1).astype(int)
     footprint = np.ones(2 * reach + 1, dtype=bool)
     best = density[:, :, 0]
@@ -115,14 +115,15 @@ def _column(work: Volume, excess: Array, seen: Array, slices: Array) -> Array:
     return ndimage.gaussian_filter1d(raw, 20.0 / spacing[2], axis=0, mode="nearest")
 
 
-def _posterior(work: Volume) -> Array:
-    """A mild preference, 0 to 0.3, for the back half of the body over its front, where sternum and heart are bright."""
+def _too_far_front(work: Volume) -> Array:
+    """Penalty, 0 in the back 55 % of the body to 0.8 at its front, where sternum and ribs are bright too."""
     body = work.hu > -300
     depth = np.flatnonzero(body.any(axis=(0, 2)))
     if depth.size == 0:
         return np.zeros(work.grid.shape, dtype=np.float32)
     fraction = (np.arange(work.grid.shape[1]) - depth[0]) / max(depth[-1] - depth[0], 1)
-    return np.broadcast_to((0.3 * np.clip(1 - fraction / 0.6, 0, 1))[None, :, None], work.grid.shape).astype(np.float32)
+    penalty = 0.8 * np.clip((fraction - 0.55) / 0.45, 0, 1)
+    return np.broadcast_to(penalty.astype(np.float32)[None, :, None], work.grid.shape)
 
 
 def _around(path: Array, work: Volume, slices: Array) -> Array:
