@@ -166,8 +166,8 @@ def fit(
         state=state,
         covariance=covariance,
         sensitivity=du,
-        surface_rms_mm=_rms(rows, rows.surface),
-        keypoint_rms_mm=_rms(rows, ~rows.surface),
+        surface_rms_mm=_rms(problem, rows, rows.surface),
+        keypoint_rms_mm=_rms(problem, rows, ~rows.surface),
         history=history,
         spread=np.array([run[0] for run in runs]),
         costs=np.array([run[2][-1].cost for run in runs]),
@@ -175,14 +175,17 @@ def fit(
     )
 
 
-def ellipsoid95(result: Fit, system: PoroSystem, point: Array) -> tuple[Array, Array]:
-    """Half axes (3,) mm, longest first, and directions (3, 3) in columns, that hold an inflated point's image with 95
-    %.
+def ellipsoid95(
+    result: Fit, system: PoroSystem, point: Array, unexplained_mm: float | None = None
+) -> tuple[Array, Array]:
+    """Half axes (3,) mm, longest first, and directions (3, 3) in columns, that hold an inflated point's image with 95 %.
 
-    The parameters' covariance carried to the point, plus what the fit leaves unexplained at the points it sees.
+    The parameters' covariance carried to the point, plus the standard deviation per axis of what no parameter explains:
+    by default what the fit leaves at the points it sees; after a correction give its held-out misfit.
     """
     du = interpolate(locate(system.mesh, np.atleast_2d(point)), result.sensitivity)[0]
-    unexplained = max(result.surface_rms_mm, result.keypoint_rms_mm / np.sqrt(3))
+    left = max(result.surface_rms_mm, result.keypoint_rms_mm / np.sqrt(3))
+    unexplained = left if unexplained_mm is None else unexplained_mm
     spread = du @ result.covariance @ du.T + unexplained**2 * np.eye(3)
     values, vectors = np.linalg.eigh(spread)
     return np.sqrt(CHI2_95_3D * values[::-1]), vectors[:, ::-1]
@@ -278,10 +281,10 @@ def _covariance(problem: _Problem, rows: Residuals, du: Array, theta: Array) -> 
     return misfit * np.linalg.inv(normal)
 
 
-def _rms(rows: Residuals, chosen: Array) -> float:
-    weight = rows.weight[chosen]
-    if not weight.sum():
+def _rms(problem: _Problem, rows: Residuals, chosen: Array) -> float:
+    """Root mean square in mm of the believed part of the surface or of the inner points."""
+    if not chosen.any():
         return 0.0
-    squares = np.bincount(rows.group[chosen], rows.value[chosen] ** 2)
-    per_group = np.bincount(rows.group[chosen], weight) / np.maximum(np.bincount(rows.group[chosen]), 1)
-    return float(np.sqrt((squares * per_group).sum() / per_group.sum()))
+    weight = rows.weight[chosen] * problem.influence(rows)[chosen]
+    axes = len(rows.value[chosen]) / max(len(np.unique(rows.group[chosen])), 1)
+    return float(np.sqrt(axes * (weight * rows.value[chosen] ** 2).sum() / max(weight.sum(), 1e-30)))
