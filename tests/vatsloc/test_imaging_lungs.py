@@ -106,6 +106,16 @@ def test_ct_without_the_operated_lung_is_refused() -> None:
         segment_lungs(known.thorax(one_lung=True).volume, "left")
 
 
+def test_ct_cropped_through_the_other_lung_keeps_both() -> None:
+    scene = known.thorax(touching=True)
+    start = 44
+    affine = scene.volume.ras_from_ijk.copy()
+    affine[:3, 3] = scene.volume.grid.to_ras(np.array([start, 0.0, 0.0]))
+    lungs = segment_lungs(Volume(scene.volume.hu[start:].copy(), affine), "right")
+    truth = Mask(scene.lungs["right"].inside[start:], affine)
+    assert known.dice(lungs.right, truth) > 0.96
+
+
 @pytest.mark.shared
 def test_lungs_of_a_real_ct_are_plausible(shared: Path) -> None:
     case = read_case(shared / "cases" / "twin-a")

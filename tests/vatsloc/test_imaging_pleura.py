@@ -176,3 +176,12 @@ def test_pleural_air_of_a_twin_is_plausible(shared: Path) -> None:
     ijk = np.rint(seen.air.grid.to_ijk(dense[:, 6:9])).astype(int)
     within = ((ijk >= 0) & (ijk < seen.air.grid.shape)).all(axis=1)
     assert seen.air.inside[tuple(ijk[within].T)].mean() < 0.12
+
+
+def test_nothing_where_the_prior_is_empty(deflated: PreparedCbct, prior: ThoraxPrior) -> None:
+    nowhere = Mask(np.zeros_like(prior.lung.inside), prior.lung.ras_from_ijk)
+    found = find_pneumothorax(deflated, ThoraxPrior(nowhere, nowhere, nowhere))
+    assert not found.is_collapsed
+    assert found.lung_ml == 0.0
+    assert len(deflated_surface(found, deflated.field)) == 0
+    assert len(diaphragm_points(found.space, found.image, deflated.field)) == 0
