@@ -7,11 +7,14 @@ from numba import njit, prange
 
 from registration.volume import Array, Grid
 
+THREADS_FROM = 30_000
+CHUNKS = 16
 
-@njit(cache=True, parallel=True, fastmath=True)
-def _values(voxels, points, fill, out):
+
+@njit(cache=True, fastmath=True)
+def _values(voxels, points, fill, out, start, stop):
     ni, nj, nk = voxels.shape
-    for n in prange(points.shape[0]):
+    for n in range(start, stop):
         x, y, z = points[n, 0], points[n, 1], points[n, 2]
         if not (0.0 <= x <= ni - 1 and 0.0 <= y <= nj - 1 and 0.0 <= z <= nk - 1):
             out[n] = fill
@@ -27,15 +30,17 @@ def _values(voxels, points, fill, out):
         out[n] = lower * (1 - a) + upper * a
 
 
-@njit(cache=True, parallel=True, fastmath=True)
-def warp_samples(voxels, base, displacement, index, ijk_from_ras, out, gradient):
-    """Values and gradients of voxels (ni, nj, nk) at base + A u: what a registration needs at its samples, in one pass.
+@njit(cache=True, parallel=True)
+def _values_threads(voxels, points, fill, out):
+    n = points.shape[0]
+    for c in prange(CHUNKS):
+        _values(voxels, points, fill, out, n * c // CHUNKS, n * (c + 1) // CHUNKS)
 
-    base: (n, 3) voxel coordinates; displacement: (3, m) mm, read at index (n,); ijk_from_ras: A, (3, 3), 1/mm;
-    out: (n,) values; gradient: (3, n) per mm. Beyond the image its nearest value holds, so its gradient is zero there.
-    """
+
+@njit(cache=True, fastmath=True)
+def _warp(voxels, base, displacement, index, ijk_from_ras, out, gradient, start, stop):
     ni, nj, nk = voxels.shape
-    for n in prange(base.shape[0]):
+    for n in range(start, stop):
         u0, u1, u2 = displacement[0, index[n]], displacement[1, index[n]], displacement[2, index[n]]
         x = base[n, 0] + ijk_from_ras[0, 0] * u0 + ijk_from_ras[0, 1] * u1 + ijk_from_ras[0, 2] * u2
         y = base[n, 1] + ijk_from_ras[1, 0] * u0 + ijk_from_ras[1, 1] * u1 + ijk_from_ras[1, 2] * u2
@@ -63,6 +68,31 @@ def warp_samples(voxels, base, displacement, index, ijk_from_ras, out, gradient)
             gradient[m, n] = ijk_from_ras[0, m] * dx + ijk_from_ras[1, m] * dy + ijk_from_ras[2, m] * dz
 
 
+@njit(cache=True, parallel=True)
+def _warp_threads(voxels, base, displacement, index, ijk_from_ras, out, gradient):
+    n = base.shape[0]
+    for c in prange(CHUNKS):
+        start, stop = n * c // CHUNKS, n * (c + 1) // CHUNKS
+        _warp(voxels, base, displacement, index, ijk_from_ras, out, gradient, start, stop)
+
+
+def warp_samples(
+    voxels: Array, base: Array, displacement: Array, index: Array, ijk_from_ras: Array
+) -> tuple[Array, Array]:
+    """Values (n,) and gradients (3, n) per mm of voxels (ni, nj, nk) at base + A u, in the precision of u.
+
+    base: (n, 3) voxel coordinates; displacement: u (3, m) mm, read at index (n,); ijk_from_ras: A, (3, 3), 1/mm.
+    Beyond the image its nearest value holds, so its gradient is zero there.
+    """
+    n = len(base)
+    out, gradient = np.empty(n, dtype=displacement.dtype), np.empty((3, n), dtype=displacement.dtype)
+    if n > THREADS_FROM:
+        _warp_threads(voxels, base, displacement, index, ijk_from_ras, out, gradient)
+    else:
+        _warp(voxels, base, displacement, index, ijk_from_ras, out, gradient, 0, n)
+    return out, gradient
+
+
 def _checked(voxels: Array) -> Array:
     if voxels.ndim != 3 or min(voxels.shape) < 2:
         raise ValueError(f"an image needs three axes of at least 2 voxels to be interpolated, got shape {voxels.shape}")
@@ -73,5 +103,8 @@ def interpolate(voxels: Array, grid: Grid, points_ras: Array, fill: float) -> Ar
     """Trilinear values (n,) float32 at points (n, 3) in RAS mm; `fill` outside the hull of the voxel centres."""
     points = np.ascontiguousarray(grid.to_ijk(np.asarray(points_ras, dtype=float)))
     out = np.empty(len(points), dtype=np.float32)
-    _values(_checked(voxels), points, np.float32(fill), out)
+    if len(points) > THREADS_FROM:
+        _values_threads(_checked(voxels), points, np.float32(fill), out)
+    else:
+        _values(_checked(voxels), points, np.float32(fill), out, 0, len(points))
     return out

@@ -38,7 +38,7 @@ class GlobalNcc:
         m = m - np.average(m, weights=w)
         mm = max(float(np.dot(w * m, m)), 1e-12)
         ff = max(float(np.dot(w * f, f)), 1e-12)
-        ncc = float(np.dot(w * f, m)) / np.sqrt(mm * ff)
+        ncc = float(np.dot(w * f, m) / np.sqrt(mm * ff))
         if not with_slope:
             return Similarity(1 - ncc, np.zeros(0), np.zeros(0))
         slope = -w * (f / np.sqrt(mm * ff) - ncc * m / mm)

@@ -31,14 +31,15 @@ class Pyramid:
         """The pair with voxels of `voxel_mm`; what the moving image does not see never blurs into what it sees."""
         fixed = coarsen(self._fixed, voxel_mm)
         index = np.flatnonzero(coarsen_mask(self._fixed_mask, voxel_mm).hu >= 0.5)
-        moving, seen = coarsen(self._moving, voxel_mm), None
-        if self._moving_mask is not None:
+        if self._moving_mask is None:
+            moving, seen = coarsen(self._moving, voxel_mm), None
+        else:
             seen = coarsen_mask(self._moving_mask, voxel_mm)
-            weighted = coarsen(
-                Volume(np.where(self._moving_mask.inside, self._moving.hu, np.float32(0)), self._moving.ras_from_ijk),
-                voxel_mm,
-            )
-            hu = np.where(seen.hu > 0.02, weighted.hu / np.maximum(seen.hu, 0.02), moving.hu)
+            inside = self._moving_mask.inside
+            level = self._moving.hu[inside].mean(dtype=float) if inside.any() else 0.0
+            hu = np.where(inside, self._moving.hu - np.float32(level), np.float32(0))
+            moving = coarsen(Volume(hu, self._moving.ras_from_ijk), voxel_mm)
+            hu = moving.hu / np.maximum(seen.hu, 0.05) + np.float32(level)
             moving = Volume(hu.astype(np.float32), moving.ras_from_ijk)
         return Images(Samples(fixed.grid, index), fixed.hu.reshape(-1)[index], moving, seen)
 

@@ -79,7 +79,7 @@ class ImageTerm:
         """Reset each sample's weight to how well the moving image sees it at c (soft rejection)."""
         if self._seen is not None:
             moved = self._points + self._displacement(c)[:, self.samples.index].T
-            share = 2 * interpolate(self._seen.hu, self._seen.grid, moved, 0.0) - 0.5
+            share = 4 * interpolate(self._seen.hu, self._seen.grid, moved, 0.0) - 3
             self.share = np.clip(share, 0, 1).astype(np.float32)
 
     def value(self, c: Array) -> float:
@@ -119,10 +119,7 @@ class ImageTerm:
         return np.ascontiguousarray(self._lattice.forward(c).reshape(3, -1))
 
     def _warped(self, u: Array) -> tuple[Array, Array]:
-        n = len(self.samples.index)
-        m, g = np.empty(n, dtype=u.dtype), np.empty((3, n), dtype=u.dtype)
-        warp_samples(self._moving.hu, self._base, u, self.samples.index, self._a, m, g)
-        return m, g
+        return warp_samples(self._moving.hu, self._base, u, self.samples.index, self._a)
 
     def _det(self, c: Array) -> tuple[Array, Array]:
         """det(dT/dx) of each sample's block, (n,), and the blocks' gradients."""

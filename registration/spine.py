@@ -5,7 +5,6 @@ Ref: Alvarez 2021, section 6.1.1 (there with one clicked vertebra).
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 
@@ -14,13 +13,16 @@ from numba import njit, prange
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
-from registration.interpolate import warp_samples
+from registration.interpolate import interpolate, warp_samples
 from registration.metric import GlobalNcc
-from registration.resample import coarsen
+from registration.pyramid import Pyramid
+from registration.resample import coarsen, coarsen_mask
 from registration.rigid import RigidTransform
 from registration.volume import Array, Mask, Volume
 
 BONE_WINDOW = (-150.0, 700.0)
+UNSEEN = -1e4
+LEAST_OVERLAP = 0.5
 
 
 class RigidStatus(Enum):
@@ -51,18 +53,19 @@ class SpineSearch:
 
     shift_mm: float = 120.0
     angle_degrees: float = 25.0
-    surroundings_mm: float = 25.0
-    margin: float = 0.03
+    surroundings_mm: float = 40.0
+    margin: float = 0.02
     least_ncc: float = 0.5
 
 
 @dataclass(frozen=True)
 class _Pair:
-    """Samples of the fixed image and the moving image at one resolution."""
+    """Samples of the fixed image, the moving image and where that sees, at one resolution."""
 
     points: Array
     values: Array
     moving: Volume
+    seen: Volume
 
 
 def register_spine(
@@ -72,68 +75,93 @@ def register_spine(
     moving_spine: Mask | None = None,
     *,
     initial: RigidTransform | None = None,
+    fixed_seen: Mask | None = None,
+    moving_seen: Mask | None = None,
     search: SpineSearch | None = None,
-    progress: Callable[[str, float], None] | None = None,
 ) -> RigidFit:
     """Find the rigid map under which the moving image around the spine looks like the fixed one.
 
     Starts from every pose of a grid of shifts and rotations about `initial` (default identity, the images' headers);
-    moving_spine, when given, drops poses that carry the fixed spine off it. The best distinct poses are refined at 4
-    and 2 mm; the runner-up is the best that ends elsewhere, or a slip along the spine by one vertebra refined in turn.
+    moving_spine, when given, drops poses that carry the fixed spine off it. fixed_seen, moving_seen: fields of view.
+    The best distinct poses are refined at 4 and 2 mm; the runner-up is the best that ends elsewhere, or a slip along
+    the spine by one vertebra refined in turn.
     """
     search = search or SpineSearch()
     initial = initial or RigidTransform.identity()
+    if not fixed_spine.inside.any():
+        raise ValueError("the fixed spine mask is empty; check its segmentation")
     centre = fixed_spine.grid.to_ras(np.argwhere(fixed_spine.inside).mean(axis=0))
-    pairs = [
-        _pair(fixed, moving, fixed_spine, search, voxel, n) for voxel, n in ((8.0, 600), (4.0, 4000), (2.0, 12000))
-    ]
-    poses = _coarse(pairs[0], centre, initial, search, moving_spine)
-    if progress is not None:
-        progress("spine: refining", 0.4)
-    refined = [_refine(pairs[1], pose, centre, 12) for pose in _distinct(poses, centre, 12.0, 15.0)[:16]]
-    refined.sort(key=lambda item: -item[1])
-    best = [_refine(pairs[2], pose, centre, 8) for pose, _ in _apart(refined, centre, 8.0)[:3]]
-    best.sort(key=lambda item: -item[1])
+    coarse, middle, fine = _pairs(fixed, moving, fixed_spine, fixed_seen, moving_seen, search.surroundings_mm)
+    poses = _coarse(coarse, centre, initial, search, moving_spine)
+    best = _climbed(poses, (middle, fine), centre, 4)
+    if not best:
+        return RigidFit(initial, RigidStatus.POOR, -1.0, -1.0, 0.0, 0.0)
     pose, ncc = best[0]
     axis = _spine_axis(fixed_spine)
-    slips = [_refine(pairs[1], pose @ _shift(s * axis), centre, 12) for s in (-42, -30, -20, 20, 30, 42)]
-    slips = [
-        _refine(pairs[2], p, centre, 8) for p, _ in _apart(sorted(slips, key=lambda item: -item[1]), centre, 8.0)[:3]
-    ]
-    others = [(p, q) for p, q in best[1:] + slips if _distance(p, pose, centre) > 8.0]
+    slips = [pose @ _shift(s * axis) for s in (-42.0, -30.0, -20.0, 20.0, 30.0, 42.0)]
+    others = [item for item in best[1:] + _climbed(slips, (middle, fine), centre, 3) if _far(item[0], pose, centre)]
     second, second_ncc = max(others, key=lambda item: item[1], default=(pose, -1.0))
     status = RigidStatus.FOUND
     if ncc < search.least_ncc:
         status = RigidStatus.POOR
     elif ncc - second_ncc < search.margin:
         status = RigidStatus.AMBIGUOUS
-    moved = moving.grid.to_ijk(pose(pairs[2].points))
-    overlap = float(np.mean(np.all((moved >= 0) & (moved <= np.array(moving.hu.shape) - 1), axis=1)))
+    overlap = float(_weights(fine, pose(fine.points)).mean())
     return RigidFit(pose, status, ncc, second_ncc, _distance(second, pose, centre), overlap)
 
 
-def _pair(fixed: Volume, moving: Volume, spine: Mask, search: SpineSearch, voxel_mm: float, most: int) -> _Pair:
-    coarse = coarsen(fixed, voxel_mm)
-    near = coarsen(Volume(spine.inside.astype(np.float32), spine.ras_from_ijk), voxel_mm).hu > 0.1
-    distance = ndimage.distance_transform_edt(~near, sampling=coarse.grid.spacing)
-    index = np.argwhere((distance <= search.surroundings_mm) & (coarse.hu > -990))
-    if len(index) < 50:
-        raise ValueError(
-            f"the fixed spine mask leaves {len(index)} samples of {voxel_mm} mm, 50 needed; check the mask"
-        )
-    index = index[np.random.default_rng(0).permutation(len(index))[:most]]
+def _pairs(
+    fixed: Volume,
+    moving: Volume,
+    spine: Mask,
+    fixed_seen: Mask | None,
+    moving_seen: Mask | None,
+    surroundings_mm: float,
+) -> list[_Pair]:
+    """Pairs at 8, 4 and 2 mm, each coarsened from the finer one, with samples around the spine that the image shows."""
+    everywhere = Mask(np.ones(moving.hu.shape, dtype=bool), moving.ras_from_ijk)
+    seen = coarsen_mask(moving_seen or everywhere, 2.0)
+    images = Pyramid(fixed, spine, moving, moving_seen).at(2.0)
     low, high = BONE_WINDOW
-    values = np.clip(coarse.hu[tuple(index.T)], low, high)
-    seen = coarsen(moving, voxel_mm)
-    return _Pair(
-        coarse.grid.to_ras(index.astype(float)), values, Volume(np.clip(seen.hu, low, high), seen.ras_from_ijk)
-    )
+    fixed, moving = coarsen(fixed, 2.0), images.moving
+    shown = None if fixed_seen is None else coarsen_mask(fixed_seen, 2.0)
+    inside = coarsen(coarsen_mask(spine, 2.0), 4.0)
+    away = ndimage.distance_transform_edt(inside.hu < 0.1, sampling=inside.grid.spacing)
+    pairs = []
+    for voxel, most in ((2.0, 12000), (4.0, 4000), (8.0, 600)):
+        fixed, moving, seen = (coarsen(v, voxel) for v in (fixed, moving, seen))
+        points = fixed.grid.points().reshape(-1, 3)
+        taken = interpolate(away, inside.grid, points, 1e3) <= surroundings_mm
+        if shown is not None:
+            taken &= interpolate(shown.hu, shown.grid, points, 0.0) > 0.99
+        index = np.flatnonzero(taken)
+        if len(index) < 50:
+            raise ValueError(
+                f"the fixed spine mask leaves {len(index)} samples of {voxel} mm, 50 needed; check the mask"
+            )
+        index = index[np.random.default_rng(0).permutation(len(index))[:most]]
+        values = np.clip(fixed.hu.reshape(-1)[index], low, high)
+        clipped = Volume(np.clip(moving.hu, low, high), moving.ras_from_ijk)
+        pairs.append(_Pair(points[index], values, clipped, seen))
+    return pairs[::-1]
+
+
+def _climbed(
+    starts: list[RigidTransform], pairs: tuple[_Pair, _Pair], centre: Array, most: int
+) -> list[tuple[RigidTransform, float]]:
+    """Distinct poses refined at both resolutions with their correlations, best first."""
+    fits = sorted((_refine(pairs[0], pose, centre, 12) for pose in starts), key=lambda item: -item[1])
+    apart: list[tuple[RigidTransform, float]] = []
+    for pose, ncc in fits:
+        if ncc > -1 and len(apart) < most and all(_far(pose, k, centre) for k, _ in apart):
+            apart.append((pose, ncc))
+    return sorted((_refine(pairs[1], pose, centre, 8) for pose, _ in apart), key=lambda item: -item[1])
 
 
 def _coarse(
     pair: _Pair, centre: Array, initial: RigidTransform, search: SpineSearch, moving_spine: Mask | None
-) -> list[tuple[RigidTransform, float]]:
-    """Every pose of the search grid with its correlation at the coarsest resolution, best first."""
+) -> list[RigidTransform]:
+    """Best distinct poses of the search grid at the coarsest resolution."""
     step = 10.0
     ticks = np.arange(-search.shift_mm, search.shift_mm + step / 2, step)
     shifts = np.stack(np.meshgrid(ticks, ticks, ticks, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -146,18 +174,22 @@ def _coarse(
     base = np.stack([relative @ (ijk[:3, :3] @ initial.matrix[:3, :3] @ r).T for r in turns])
     target = pair.moving.grid.to_ijk(initial(centre[None])[0] + shifts)
     scores = np.empty((len(turns), len(shifts)), dtype=np.float32)
-    _scores(
-        np.ascontiguousarray(pair.moving.hu), base.astype(np.float32), target.astype(np.float32), pair.values, scores
-    )
-    order = np.argsort(-scores, axis=None)[:3000]
-    found = []
-    for flat in order:
+    unseen = np.where(pair.seen.hu > 0.9, pair.moving.hu, np.float32(2 * UNSEEN))
+    _scores(np.ascontiguousarray(unseen), base.astype(np.float32), target.astype(np.float32), pair.values, scores)
+    kept: list[RigidTransform] = []
+    for flat in np.argsort(-scores, axis=None)[:4000]:
         t, s = np.unravel_index(flat, scores.shape)
         m = np.eye(4)
         m[:3, :3] = initial.matrix[:3, :3] @ turns[t]
         m[:3, 3] = initial(centre[None])[0] + shifts[s] - m[:3, :3] @ centre
-        found.append((RigidTransform(m), float(scores[t, s])))
-    return found
+        pose = RigidTransform(m)
+        if scores[t, s] > 0 and all(
+            _distance(pose, k, centre) > 12.0 or (pose @ k.inverse()).angle_degrees > 15.0 for k in kept
+        ):
+            kept.append(pose)
+        if len(kept) == 24:
+            break
+    return kept
 
 
 def _turns(half_width: float) -> list[Array]:
@@ -188,6 +220,8 @@ def _scores(voxels, base, target, values, scores):
                 if x < 0 or y < 0 or z < 0 or i >= ni or j >= nj or k >= nk:
                     continue
                 f, m = values[p], voxels[i, j, k]
+                if m < UNSEEN:
+                    continue
                 count += 1
                 sf, sm = sf + f, sm + m
                 sff, smm, sfm = sff + f * f, smm + m * m, sfm + f * m
@@ -200,42 +234,36 @@ def _scores(voxels, base, target, values, scores):
 
 def _refine(pair: _Pair, pose: RigidTransform, centre: Array, steps: int) -> tuple[RigidTransform, float]:
     """Gauss-Newton on rotation about `centre` and shift, damped until each step raises the correlation."""
-    metric, n = GlobalNcc(pair.values), len(pair.points)
+    metric = GlobalNcc(pair.values)
     a = np.ascontiguousarray(pair.moving.grid.ijk_from_ras[:3, :3])
-    still, index = np.zeros((3, 1)), np.zeros(n, dtype=np.int64)
-    last = np.array(pair.moving.hu.shape) - 1.0
-    m, g = np.empty(n), np.empty((3, n))
+    still, index = np.zeros((3, 1)), np.zeros(len(pair.points), dtype=np.int64)
 
-    def sampled(p: RigidTransform) -> tuple[Array, Array]:
+    def sampled(p: RigidTransform) -> tuple[Array, Array, Array, Array]:
         moved = p(pair.points)
         base = np.ascontiguousarray(pair.moving.grid.to_ijk(moved))
-        warp_samples(pair.moving.hu, base, still, index, a, m, g)
-        return moved, np.all((base >= 0) & (base <= last), axis=1).astype(float)
+        return moved, _weights(pair, moved), *warp_samples(pair.moving.hu, base, still, index, a)
 
-    moved, w = sampled(pose)
-    if w.mean() < 0.5:
+    moved, w, m, g = sampled(pose)
+    if w.mean() < LEAST_OVERLAP:
         return pose, -1.0
     here, damping = metric.evaluate(m, w), 1e-3
     for _ in range(steps):
-        arm = moved - pose(centre[None])
-        jacobian = np.concatenate([np.cross(arm, g.T), g.T], axis=1)
+        pivot = pose(centre[None])[0]
+        jacobian = np.concatenate([np.cross(moved - pivot, g.T), g.T], axis=1)
         gradient = jacobian.T @ here.slope
         hessian = (jacobian * here.curvature[:, None]).T @ jacobian
-        improved = False
-        for _ in range(5):
+        value, improved = here.value, False
+        while not improved and damping < 1e3:
             d = -np.linalg.solve(hessian + damping * np.diag(np.diag(hessian)) + 1e-12 * np.eye(6), gradient)
-            trial = RigidTransform.about(pose(centre[None])[0], d[:3], d[3:]) @ pose
-            trial_moved, trial_w = sampled(trial)
-            there = metric.evaluate(m, trial_w)
-            if trial_w.mean() >= 0.5 and there.value < here.value:
-                improved = True
-                break
-            damping *= 10
+            trial = RigidTransform.about(pivot, d[:3], d[3:]) @ pose
+            trial_moved, w, m, trial_g = sampled(trial)
+            there = metric.evaluate(m, w) if w.mean() >= LEAST_OVERLAP else here
+            improved = there.value < value
+            damping *= 0.2 if improved else 10
         if not improved:
             break
-        gain, damping = here.value - there.value, damping / 5
-        pose, moved, here = trial, trial_moved, there
-        if gain < 1e-5:
+        pose, moved, g, here = trial, trial_moved, trial_g, there
+        if value - here.value < 1e-5:
             break
     return pose, 1 - here.value
 
@@ -244,27 +272,13 @@ def _distance(a: RigidTransform, b: RigidTransform, centre: Array) -> float:
     return float(np.linalg.norm(a(centre[None]) - b(centre[None])))
 
 
-def _distinct(
-    poses: list[tuple[RigidTransform, float]], centre: Array, apart_mm: float, apart_degrees: float
-) -> list[RigidTransform]:
-    """Poses, best first, without those close to a better one in both place and direction."""
-    kept: list[RigidTransform] = []
-    for pose, _ in poses:
-        if all(
-            _distance(pose, k, centre) > apart_mm or (pose @ k.inverse()).angle_degrees > apart_degrees for k in kept
-        ):
-            kept.append(pose)
-    return kept
+def _far(a: RigidTransform, b: RigidTransform, centre: Array) -> bool:
+    return _distance(a, b, centre) > 8.0
 
 
-def _apart(
-    fits: list[tuple[RigidTransform, float]], centre: Array, apart_mm: float
-) -> list[tuple[RigidTransform, float]]:
-    kept: list[tuple[RigidTransform, float]] = []
-    for pose, ncc in fits:
-        if all(_distance(pose, k, centre) > apart_mm for k, _ in kept):
-            kept.append((pose, ncc))
-    return kept
+def _weights(pair: _Pair, moved: Array) -> Array:
+    """1 for samples (n,) that land where the moving image sees, else 0."""
+    return (interpolate(pair.seen.hu, pair.seen.grid, moved, 0.0) > 0.9).astype(float)
 
 
 def _spine_axis(spine: Mask) -> Array:

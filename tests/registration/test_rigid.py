@@ -1,0 +1,118 @@
+"""Rigid transforms and the spine: poses by value, from any start, and a slip by one vertebra told apart."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from registration.rigid import RigidTransform
+from registration.spine import RigidStatus, SpineSearch, register_spine
+from registration.volume import Array, Grid, Mask, Volume
+from tests.registration.scenes import oriented
+
+CENTRE = np.array([0.0, -60.0, 100.0])
+PITCH = 24.0
+
+
+def spine_hu(points: Array, marked: float = 1.0) -> Array:
+    """A column of equal vertebrae every 24 mm along S in soft tissue; ribs lengthen downwards, times `marked`."""
+    x, y, z = (points - CENTRE).T
+    phase = (z + 2000.5 * PITCH) % PITCH - PITCH / 2
+    level = np.floor((z + 2000.5 * PITCH) / PITCH) - 2000
+    hu = np.full(len(points), 40.0)
+    hu[np.hypot(x, y) > 60] = -800.0
+    body = (np.hypot(x, y) < 16) & (np.abs(phase) < 9)
+    process = (np.abs(x) < 4) & (y < -14) & (y > -40) & (np.abs(phase + 3) < 6)
+    reach = 36 + marked * 7 * level
+    rib = (np.abs(phase) < 4) & (np.abs(y + 14) < 4) & (np.abs(x) < reach) & (np.abs(x) > 18)
+    hu[body] = 350.0
+    hu[process | rib] = 600.0
+    return hu
+
+
+def scene(grid: Grid, move: RigidTransform | None = None, marked: float = 1.0) -> Volume:
+    points = grid.points().reshape(-1, 3)
+    hu = spine_hu(points if move is None else move(points), marked).reshape(grid.shape)
+    return Volume(hu.astype(np.float32), grid.ras_from_ijk)
+
+
+def column(grid: Grid, move: RigidTransform) -> Mask:
+    points = move(grid.points().reshape(-1, 3)) - CENTRE
+    return Mask((np.hypot(points[:, 0], points[:, 1] + 5) < 25).reshape(grid.shape), grid.ras_from_ijk)
+
+
+MOVING = oriented("RAS", (60, 60, 110), 3.0, CENTRE)
+
+
+def fixed_grid(move: RigidTransform) -> Grid:
+    """Where the fixed image must lie to see the spine's middle."""
+    return oriented("LPS", (44, 44, 46), 3.0, move.inverse()(CENTRE[None])[0] + np.array([5.0, -5.0, -10.0]))
+
+
+FAST = SpineSearch(shift_mm=60.0, surroundings_mm=30.0)
+
+
+@pytest.mark.parametrize(
+    ("turn_degrees", "shift"), [((0, 0, 14), (8, -5, 30)), ((12, -8, -10), (-20, 15, -35)), ((-5, 4, 0), (0, 0, 3))]
+)
+def test_the_pose_comes_back_from_far_away(turn_degrees: Array, shift: Array) -> None:
+    move = RigidTransform.about(CENTRE, np.radians(turn_degrees), np.array(shift, dtype=float))
+    grid = fixed_grid(move)
+    fit = register_spine(scene(grid, move), scene(MOVING), column(grid, move), search=FAST)
+    assert fit.status is RigidStatus.FOUND
+    probe = CENTRE + np.array([[0, 0, 0], [20, 0, 0], [0, 20, 0], [0, 0, 40.0]])
+    assert np.linalg.norm(fit.moving_from_fixed(probe) - move(probe), axis=1).max() < 0.8
+    assert fit.runner_up_ncc < fit.ncc - FAST.margin
+    assert_allclose(fit.runner_up_shift_mm, PITCH, atol=4.0)
+
+
+def test_equal_vertebrae_are_called_ambiguous() -> None:
+    """Without ribs that tell them apart, one vertebra up or down looks the same, and must not pass for found."""
+    move = RigidTransform.about(CENTRE, np.radians([0.0, 5.0, 8.0]), np.array([4.0, 2.0, 10.0]))
+    grid = fixed_grid(move)
+    fit = register_spine(scene(grid, move, marked=0.0), scene(MOVING, marked=0.0), column(grid, move), search=FAST)
+    assert fit.status is RigidStatus.AMBIGUOUS
+
+
+def test_a_start_nearby_replaces_the_search() -> None:
+    move = RigidTransform.about(CENTRE, np.radians([10.0, 0.0, 20.0]), np.array([90.0, 60.0, -80.0]))
+    near = RigidTransform.about(CENTRE, np.zeros(3), np.array([3.0, -2.0, 4.0])) @ move
+    close = SpineSearch(shift_mm=10.0, angle_degrees=8.0, surroundings_mm=30.0)
+    grid = fixed_grid(move)
+    fit = register_spine(scene(grid, move), scene(MOVING), column(grid, move), initial=near, search=close)
+    assert_allclose(fit.moving_from_fixed(CENTRE[None]), move(CENTRE[None]), atol=0.4)
+
+
+def test_nothing_in_common_is_called_poor() -> None:
+    still = RigidTransform.identity()
+    noise = Volume(np.random.default_rng(0).normal(0, 200, MOVING.shape).astype(np.float32), MOVING.ras_from_ijk)
+    grid = fixed_grid(still)
+    fit = register_spine(scene(grid), noise, column(grid, still), search=FAST)
+    assert fit.status is RigidStatus.POOR
+
+
+def test_transforms_compose_and_invert() -> None:
+    rng = np.random.default_rng(0)
+    a = RigidTransform.about(CENTRE, np.array([0.1, 0.2, 0.3]), np.array([1.0, 2.0, 3.0]))
+    b = RigidTransform.about(np.zeros(3), np.array([0.0, -0.5, 0.1]), np.array([-4.0, 0.0, 9.0]))
+    x = rng.normal(scale=50, size=(20, 3))
+    assert_allclose((a @ b)(x), a(b(x)), atol=1e-10)
+    assert_allclose(a.inverse()(a(x)), x, atol=1e-10)
+    quarter = RigidTransform.about(np.zeros(3), np.array([0, 0, np.pi / 2]), np.zeros(3))
+    assert_allclose(quarter(np.array([[1.0, 0.0, 0.0]])), [[0.0, 1.0, 0.0]], atol=1e-12)
+    assert_allclose(quarter.angle_degrees, 90.0)
+
+
+def test_mirrors_and_scalings_are_refused() -> None:
+    with pytest.raises(ValueError, match="proper rotation"):
+        RigidTransform(np.diag([-1.0, 1.0, 1.0, 1.0]))
+    with pytest.raises(ValueError, match="proper rotation"):
+        RigidTransform(np.diag([1.1, 1.0, 1.0, 1.0]))
+
+
+def test_an_empty_spine_is_refused() -> None:
+    grid = fixed_grid(RigidTransform.identity())
+    empty = Mask(np.zeros(grid.shape, dtype=bool), grid.ras_from_ijk)
+    with pytest.raises(ValueError, match="spine mask is empty"):
+        register_spine(scene(grid), scene(MOVING), empty)
