@@ -35,14 +35,16 @@ class Hilum:
 def find_hilum(lung: Mask, airways: Mask, side: Side) -> Hilum:
     """Centre of the bronchi where they cross the lung's surface; else the middle of its mediastinal face."""
     box = bounding_box(lung.inside, np.full(3, 6))
-    spacing = lung.grid.spacing
-    inside, tubes = lung.inside[box], airways.inside[box]
+    step = np.maximum(np.rint(2.0 / lung.grid.spacing), 1).astype(int)
+    thin = tuple(slice(b.start, b.stop, int(s)) for b, s in zip(box, step, strict=True))
+    spacing = lung.grid.spacing * step
+    inside, tubes = lung.inside[thin], airways.inside[thin]
     start = np.array([b.start for b in box])
     band = dilate(inside, BAND_MM, spacing) & ~erode(inside, BAND_MM, spacing)
-    entry = largest(ndimage.binary_dilation(tubes, iterations=2) & band) & tubes
+    entry = largest(ndimage.binary_dilation(tubes, iterations=1) & band) & tubes
     if entry.sum() * spacing.prod() / 1000 >= LEAST_ENTRY_ML:
-        return Hilum(lung.grid.to_ras(np.argwhere(entry).mean(axis=0) + start), RADIUS_MM, True)
-    points = lung.grid.to_ras(np.argwhere(inside ^ erode(inside, float(spacing.max()), spacing)) + start)
+        return Hilum(lung.grid.to_ras(np.argwhere(entry).mean(axis=0) * step + start), RADIUS_MM, True)
+    points = lung.grid.to_ras(np.argwhere(inside ^ erode(inside, float(spacing.max()), spacing)) * step + start)
     low, high = np.percentile(points, [5.0, 95.0], axis=0)
     middle = (np.abs(points[:, 2] - (0.45 * low[2] + 0.55 * high[2])) < 0.1 * (high[2] - low[2])) & (
         np.abs(points[:, 1] - (low[1] + high[1]) / 2) < 0.15 * (high[1] - low[1])
