@@ -178,7 +178,7 @@ def fit(
 def ellipsoid95(
     result: Fit, system: PoroSystem, point: Array, unexplained_mm: float | None = None
 ) -> tuple[Array, Array]:
-    """Half axes (3,) mm, longest first, and directions (3, 3) in columns, that hold an inflated point's image with 95 %.
+    """Half axes (3,) mm, longest first, and directions (3, 3) in columns, that hold a point's deflated image with 95 %.
 
     The parameters' covariance carried to the point, plus the standard deviation per axis of what no parameter explains:
     by default what the fit leaves at the points it sees; after a correction give its held-out misfit.

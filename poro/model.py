@@ -148,7 +148,7 @@ def assemble(
     body = solid(mesh, tissue, hilum)
     boundary = mesh.boundary
     edge = float(np.sqrt(boundary.areas.mean() * 4 / np.sqrt(3)))
-    level = level_set(boundary, 0.5 * edge, edge if smooth_mm is None else smooth_mm)
+    level = level_set(boundary, 0.7 * edge, edge if smooth_mm is None else smooth_mm)
     on_wall = ~np.isin(boundary.nodes, hilum)
     nodes = boundary.nodes[on_wall]
     rest = mesh.points[nodes]

@@ -10,6 +10,8 @@ from scipy.spatial import cKDTree
 
 from poro.mesh.tetmesh import Array, TriSurface
 
+CLUSTER = 8  # triangles per bounding sphere
+
 
 @dataclass(frozen=True)
 class ClosestPoints:
@@ -29,10 +31,18 @@ def closest_points(surface: TriSurface, queries: Array) -> ClosestPoints:
     """
     queries = np.ascontiguousarray(queries, float)
     x = surface.points[surface.triangles]
-    centres = x.mean(axis=1)
-    radii = np.linalg.norm(x - centres[:, None], axis=2).max(axis=1)
-    _, guess = cKDTree(centres).query(queries)
-    triangle, bary = _search(queries, x, centres, radii, guess)
+    tree = cKDTree(x.mean(axis=1), leafsize=CLUSTER)
+    # The tree's leaf order keeps neighbours together, so that runs of it make tight bounding spheres.
+    order = tree.indices
+    sorted_x = np.ascontiguousarray(x[order])
+    starts = np.arange(0, len(order), CLUSTER)
+    place = np.empty(len(order), np.int64)
+    place[order] = np.arange(len(order))
+    centres = np.add.reduceat(sorted_x.mean(axis=1), starts) / np.diff(np.append(starts, len(order)))[:, None]
+    reach = np.linalg.norm(sorted_x - np.repeat(centres, CLUSTER, axis=0)[: len(order), None], axis=2).max(axis=1)
+    radii = np.maximum.reduceat(reach, starts)
+    found, bary = _search(queries, sorted_x, centres, radii, place[tree.query(queries)[1]])
+    triangle = order[found]
     points = np.einsum("qk,qkd->qd", bary, x[triangle])
     offset = queries - points
     normal = np.einsum("qk,qkd->qd", bary, surface.node_normals[surface.triangles[triangle]])
@@ -44,68 +54,54 @@ def closest_points(surface: TriSurface, queries: Array) -> ClosestPoints:
 
 @njit(cache=True, parallel=True)
 def _search(queries: Array, x: Array, centres: Array, radii: Array, guess: Array) -> tuple[Array, Array]:
+    """Nearest triangle and weights, clusters of triangles skipped when their sphere lies beyond the best so far."""
     found = np.empty(len(queries), np.int64)
     bary = np.empty((len(queries), 3))
     for q in prange(len(queries)):
-        p = queries[q]
-        best_w = _project(p, x[guess[q]])
+        px, py, pz = queries[q, 0], queries[q, 1], queries[q, 2]
         best = guess[q]
-        c = best_w[0] * x[best, 0] + best_w[1] * x[best, 1] + best_w[2] * x[best, 2]
-        least = np.sqrt((p[0] - c[0]) ** 2 + (p[1] - c[1]) ** 2 + (p[2] - c[2]) ** 2)
-        for t in range(len(centres)):
-            reach = least + radii[t]
-            d2 = (p[0] - centres[t, 0]) ** 2 + (p[1] - centres[t, 1]) ** 2 + (p[2] - centres[t, 2]) ** 2
-            if d2 < reach * reach:
-                w = _project(p, x[t])
-                c = w[0] * x[t, 0] + w[1] * x[t, 1] + w[2] * x[t, 2]
-                d = np.sqrt((p[0] - c[0]) ** 2 + (p[1] - c[1]) ** 2 + (p[2] - c[2]) ** 2)
-                if d < least:
-                    least, best, best_w = d, t, w
+        v, w, least = _project(px, py, pz, x[best])
+        reach = np.sqrt(least)
+        for cluster in range(len(centres)):
+            d2 = (px - centres[cluster, 0]) ** 2 + (py - centres[cluster, 1]) ** 2 + (pz - centres[cluster, 2]) ** 2
+            if d2 < (reach + radii[cluster]) ** 2:
+                for t in range(cluster * CLUSTER, min((cluster + 1) * CLUSTER, len(x))):
+                    tv, tw, gap = _project(px, py, pz, x[t])
+                    if gap < least:
+                        v, w, least, best, reach = tv, tw, gap, t, np.sqrt(gap)
         found[q] = best
-        bary[q] = best_w
+        bary[q, 0], bary[q, 1], bary[q, 2] = 1 - v - w, v, w
     return found, bary
 
 
 @njit(cache=True)
-def _project(p: Array, x: Array) -> Array:
-    """Barycentric weights of the point of triangle x (3, 3) nearest to p. Ref: Ericson 2005, section 5.1.5."""
-    w = np.zeros(3)
-    ab, ac, ap = x[1] - x[0], x[2] - x[0], p - x[0]
-    d1, d2 = _dot(ab, ap), _dot(ac, ap)
+def _project(px: float, py: float, pz: float, x: Array) -> tuple[float, float, float]:
+    """Weights of corners 1 and 2 of the point of triangle x (3, 3) nearest to p, and the squared distance.
+
+    Ref: Ericson 2005, section 5.1.5.
+    """
+    bx, by, bz = x[1, 0] - x[0, 0], x[1, 1] - x[0, 1], x[1, 2] - x[0, 2]
+    cx, cy, cz = x[2, 0] - x[0, 0], x[2, 1] - x[0, 1], x[2, 2] - x[0, 2]
+    ax, ay, az = px - x[0, 0], py - x[0, 1], pz - x[0, 2]
+    bb, bc, cc = bx * bx + by * by + bz * bz, bx * cx + by * cy + bz * cz, cx * cx + cy * cy + cz * cz
+    d1, d2 = bx * ax + by * ay + bz * az, cx * ax + cy * ay + cz * az
+    d3, d4, d5, d6 = d1 - bb, d2 - bc, d1 - bc, d2 - cc
+    va, vb, vc = d3 * d6 - d5 * d4, d5 * d2 - d1 * d6, d1 * d4 - d3 * d2
+    v, w = 0.0, 0.0
     if d1 <= 0 and d2 <= 0:
-        w[0] = 1
-        return w
-    bp = p - x[1]
-    d3, d4 = _dot(ab, bp), _dot(ac, bp)
-    if d3 >= 0 and d4 <= d3:
-        w[1] = 1
-        return w
-    vc = d1 * d4 - d3 * d2
-    if vc <= 0 and d1 >= 0 and d3 <= 0:
-        w[1] = d1 / (d1 - d3)
-        w[0] = 1 - w[1]
-        return w
-    cp = p - x[2]
-    d5, d6 = _dot(ab, cp), _dot(ac, cp)
-    if d6 >= 0 and d5 <= d6:
-        w[2] = 1
-        return w
-    vb = d5 * d2 - d1 * d6
-    if vb <= 0 and d2 >= 0 and d6 <= 0:
-        w[2] = d2 / (d2 - d6)
-        w[0] = 1 - w[2]
-        return w
-    va = d3 * d6 - d5 * d4
-    if va <= 0 and d4 - d3 >= 0 and d5 - d6 >= 0:
-        w[2] = (d4 - d3) / ((d4 - d3) + (d5 - d6))
-        w[1] = 1 - w[2]
-        return w
-    total = va + vb + vc
-    w[1], w[2] = vb / total, vc / total
-    w[0] = 1 - w[1] - w[2]
-    return w
-
-
-@njit(cache=True)
-def _dot(a: Array, b: Array) -> float:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+        pass
+    elif d3 >= 0 and d4 <= d3:
+        v = 1.0
+    elif vc <= 0 and d1 >= 0 and d3 <= 0:
+        v = d1 / bb
+    elif d6 >= 0 and d5 <= d6:
+        w = 1.0
+    elif vb <= 0 and d2 >= 0 and d6 <= 0:
+        w = d2 / cc
+    elif va <= 0 and d4 >= d3 and d5 >= d6:
+        w = (d4 - d3) / ((d4 - d3) + (d5 - d6))
+        v = 1 - w
+    else:
+        v, w = vb / (va + vb + vc), vc / (va + vb + vc)
+    ex, ey, ez = ax - v * bx - w * cx, ay - v * by - w * cy, az - v * bz - w * cz
+    return v, w, ex * ex + ey * ey + ez * ez
