@@ -215,7 +215,7 @@ def contact_sensitivity(
     wall's curvature turns the forces as the nodes slide; normal and turning forces come from one symmetric system.
     """
     active = np.flatnonzero(state.active)
-    springs = curvature_springs(compliance, np.where(state.active, state.force, 0), state.hessian, 1e-6)
+    springs = curvature_springs(compliance, np.where(state.active, state.force, 0), state.hessian, 1e-4)
     rows = np.concatenate([active, springs.rows])
     direction = np.concatenate([state.gradient[active], springs.along])
     result = np.zeros_like(free)
