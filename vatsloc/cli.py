@@ -85,9 +85,9 @@ def phantom(
 
 @app.command()
 def demo(
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the phantom case and its result.")] = Path(
-        "vatsloc-demo"
-    ),
+    out: Annotated[
+        Path, typer.Option("--out", metavar="DIR", help="Folder for the phantom case and its result.")
+    ] = Path("vatsloc-demo"),
 ) -> None:
     """Make a phantom, localize its nodule with the fast preset, score it and say where the report is."""
     from vatsloc.evaluation import evaluate_case, table
@@ -114,7 +114,7 @@ def main(arguments: list[str] | None = None) -> None:
         say(f"vatsloc: {error}")
         sys.exit(error.exit_code)
     except OSError as error:
-        say(f"vatsloc: {error.strerror or error} ({error.filename}); check the path, its permissions and the free space.")
+        say(f"vatsloc: {error.strerror or error} ({error.filename}); check path, permissions and free space.")
         sys.exit(CaseError.exit_code)
 
 

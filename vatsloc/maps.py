@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import ndimage
 
 from poro.mesh import TetMesh, interpolate, locate
+from registration.field import DisplacementField, sample_map
 from registration.rigid import RigidTransform
-from registration.volume import Array
-
-PointMap = Callable[[Array], Array]
+from registration.volume import Array, Grid, Mask
 
 
 @dataclass(frozen=True)
@@ -41,22 +40,38 @@ class MeshMap:
         return MeshMap(TetMesh(self.moved, self.mesh.tets), self.mesh.points, self.around.inverse())
 
 
-@dataclass(frozen=True)
-class BlendedMap:
-    """x -> far(x) + w(x) (near(x) - far(x)): a map known well where w is 1, and its continuation elsewhere.
+def sampled(mapping: MeshMap, grid: Grid, beyond: bool = True) -> DisplacementField:
+    """A mesh's map on voxels, (ni, nj, nk, 3) float32.
 
-    weight: points (n, 3) -> (n,) in [0, 1]; near is asked only where the weight is positive.
+    Outside the mesh a voxel moves relative to the rigid motion as the nearest voxel inside does, or not at all where
+    `beyond` is False; either is far cheaper than the nearest point of the surface.
     """
+    rigid = sample_map(mapping.around, grid).vectors
+    box, cut = _box_of(mapping.mesh, grid)
+    found = locate(mapping.mesh, box.points().reshape(-1, 3), nearest=False)
+    relative = np.zeros((*grid.shape, 3), dtype=np.float32)
+    relative[cut] = interpolate(found, mapping.relative).reshape(*box.shape, 3)
+    if beyond and found.inside.any():
+        outside = np.ones(grid.shape, dtype=bool)
+        outside[cut] = ~found.inside.reshape(box.shape)
+        nearest = ndimage.distance_transform_edt(
+            outside, sampling=grid.spacing, return_distances=False, return_indices=True
+        )
+        relative = relative[tuple(nearest)]
+    return DisplacementField(rigid + relative, grid.ras_from_ijk)
 
-    near: PointMap
-    far: PointMap
-    weight: Callable[[Array], Array]
 
-    def __call__(self, points_ras: Array) -> Array:
-        """Mapped points (n, 3) mm."""
-        out = self.far(points_ras)
-        w = self.weight(points_ras)
-        here = w > 0
-        if here.any():
-            out[here] += w[here, None] * (self.near(points_ras[here]) - out[here])
-        return out
+def covered(mesh: TetMesh, grid: Grid) -> Mask:
+    """Voxels whose centres lie in a mesh."""
+    box, cut = _box_of(mesh, grid)
+    inside = np.zeros(grid.shape, dtype=bool)
+    inside[cut] = locate(mesh, box.points().reshape(-1, 3), nearest=False).inside.reshape(box.shape)
+    return Mask(inside, grid.ras_from_ijk)
+
+
+def _box_of(mesh: TetMesh, grid: Grid) -> tuple[Grid, tuple[slice, ...]]:
+    """The part of a grid that a mesh can reach, and where it lies in the grid."""
+    ijk = grid.to_ijk(mesh.points)
+    box = grid.box(ijk.min(axis=0) - 1, ijk.max(axis=0) + 2)
+    start = np.rint(grid.to_ijk(box.ras_from_ijk[:3, 3])).astype(int)
+    return box, tuple(slice(a, a + n) for a, n in zip(start, box.shape, strict=True))

@@ -140,7 +140,7 @@ def test_a_folder_with_other_files_is_refused(tmp_path, run):
     (tmp_path / "out" / "thesis.tex").write_text("two years of work")
     if run is not None:
         (tmp_path / "out" / "run.json").write_text(run)
-    with pytest.raises(CaseError, match="other files than a vatsloc result; give an empty or a new folder"):
+    with pytest.raises(CaseError, match="files that vatsloc did not write; give an empty or a new folder"):
         write_result(tmp_path / "out", "new")
     assert (tmp_path / "out" / "thesis.tex").read_text() == "two years of work"
 

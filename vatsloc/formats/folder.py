@@ -13,7 +13,7 @@ import os
 import secrets
 import shutil
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -25,23 +25,26 @@ _UNLOCKED_GRACE_S = 60.0
 
 
 @contextmanager
-def whole_folder(target: Path, expected: Sequence[str] = (RUN_FILE,)) -> Iterator[Path]:
+def whole_folder(
+    target: Path, expected: Sequence[str] = (RUN_FILE,), replaceable: Callable[[Path], bool] | None = None
+) -> Iterator[Path]:
     """Give a temporary folder that becomes `target` when the block ends well and vanishes when it raises.
 
-    An earlier result at `target` is replaced only then. Raises CaseError when something else is there, RuntimeError
-    when the block left out a file of `expected`.
+    What is at `target` is replaced only then, and only where `replaceable` (by default `is_result`) knows it. Raises
+    CaseError when something else is there, RuntimeError when the block left out a file of `expected`.
     """
     target = target.resolve()
     target.parent.mkdir(parents=True, exist_ok=True)
     remove_leftovers(target)
-    _check_replaceable(target)
+    replaceable = replaceable or is_result
+    _check_replaceable(target, replaceable)
     partial, lock = _locked_folder(target)
     try:
         yield partial
         missing = [name for name in expected if not (partial / name).is_file()]
         if missing:
             raise RuntimeError(f"{', '.join(missing)} not written, so {target} is not made")
-        _check_replaceable(target)
+        _check_replaceable(target, replaceable)
         _swap(partial, target)
     except BaseException:
         shutil.rmtree(partial, ignore_errors=True)
@@ -113,10 +116,10 @@ def _beside(target: Path, word: str) -> list[Path]:
     return sorted(target.parent.glob(f".{glob.escape(target.name)}.{word}-*"))
 
 
-def _check_replaceable(target: Path) -> None:
+def _check_replaceable(target: Path, replaceable: Callable[[Path], bool]) -> None:
     if target.is_dir():
-        if any(target.iterdir()) and not is_result(target):
-            raise CaseError(f"{target} holds other files than a {PROGRAM} result; give an empty or a new folder.")
+        if any(target.iterdir()) and not replaceable(target):
+            raise CaseError(f"{target} holds files that {PROGRAM} did not write; give an empty or a new folder.")
     elif target.exists():
         raise CaseError(f"{target} is a file; give the name of a folder.")
 

@@ -10,24 +10,23 @@ from scipy import ndimage
 from poro.extrapolate import Extrapolation, extrapolate
 from poro.mesh import TetMesh, stuff
 from poro.tissue import Tissue
-from registration.ffd import FfdFit, FfdSettings
+from registration.ffd import FfdFit, FfdSettings, Weights
 from registration.inversion import Inversion, invert_at
-from registration.objective import Weights
 from registration.resample import coarsen_mask
 from registration.rigid import RigidTransform
 from registration.sliding import register_sliding
 from registration.spine import RigidFit, register_spine
-from registration.volume import Array, Mask, Volume
+from registration.volume import Array, Mask
 from vatsloc.case import Case
 from vatsloc.imaging.lungs import Side
 from vatsloc.imaging.thorax import carry_prior, inflated_lung, require_share, visible_share
-from vatsloc.maps import BlendedMap, MeshMap, PointMap
+from vatsloc.maps import MeshMap
 from vatsloc.workflow.prepare import Prepared
 from vatsloc.workflow.settings import RegistrationSettings, Settings
 from vatsloc.workflow.stages import Stages
 
-RIM_MM = 12.0
-"""Near the rim of what the scanner saw, the registration gives way to the mesh over this width."""
+RIM_MM = 4.0
+"""Nodes nearer than this to the rim of what the scanner saw are left to the extrapolation."""
 
 
 @dataclass(frozen=True)
@@ -47,13 +46,16 @@ class ChangeOfPose:
     inversion: Inversion
     extrapolation: Extrapolation
     overlap: float
-    inf_from_ct: PointMap
-    ct_from_inf: PointMap
 
     @property
     def inf_from_ct_rigid(self) -> RigidTransform:
         """Rigid part, CT to inflated CBCT."""
         return self.rigid.moving_from_fixed.inverse()
+
+    @property
+    def inf_from_ct(self) -> MeshMap:
+        """CT to inflated CBCT."""
+        return MeshMap(self.mesh_ct, self.points_inf, self.inf_from_ct_rigid)
 
     @property
     def mesh_inf(self) -> TetMesh:
@@ -93,29 +95,21 @@ def change_of_pose(case: Case, prepared: Prepared, settings: Settings, stages: S
     with stages.stage("inversion and extrapolation"):
         placed = inf_from_ct_rigid(mesh.points)
         inversion = invert_at(ffd.moving_from_fixed, mesh.points, placed)
-        trust = _Trust(prepared.inflated.field.usable)
-        seen = (trust(inversion.points_fixed) > 0) & (inversion.residual_mm < settings.gates.max_inversion_mm)
+        seen = _deep_inside(prepared.inflated.field.usable, inversion.points_fixed)
+        seen &= inversion.residual_mm < settings.gates.max_inversion_mm
         nodes = np.flatnonzero(seen)
         rigid_mesh = TetMesh(placed, mesh.tets)
         extension = extrapolate(rigid_mesh, nodes, (inversion.points_fixed - placed)[nodes], Tissue())
-    points_inf = placed + extension.u
-    by_mesh = MeshMap(mesh, points_inf, inf_from_ct_rigid)
-
-    def inverted(points_ct: Array) -> Array:
-        return invert_at(ffd.moving_from_fixed, points_ct, by_mesh(points_ct)).points_fixed
-
     return ChangeOfPose(
         rigid=rigid,
         ffd=ffd,
         lung_inf=lung_inf,
         mesh_ct=mesh,
-        points_inf=points_inf,
+        points_inf=placed + extension.u,
         seen=seen,
         inversion=inversion,
         extrapolation=extension,
         overlap=overlap,
-        inf_from_ct=BlendedMap(inverted, by_mesh, lambda x: trust(by_mesh(x))),
-        ct_from_inf=BlendedMap(ffd.moving_from_fixed, by_mesh.inverse(), trust),
     )
 
 
@@ -131,7 +125,7 @@ def ffd_settings(settings: RegistrationSettings) -> FfdSettings:
 
 
 def as_side(side: str) -> Side:
-    """"left" or "right", for the type checker too."""
+    """ "left" or "right", for the type checker too."""
     return "left" if side == "left" else "right"
 
 
@@ -143,16 +137,10 @@ def _hinted(case: Case) -> RigidTransform | None:
     return RigidTransform.about(inflated, np.zeros(3), ct - inflated)
 
 
-class _Trust:
-    """Weight of the registration at a point (n, 3): 0 at the rim of what was seen, 1 from RIM_MM inwards."""
-
-    def __init__(self, usable: Mask) -> None:
-        coarse = coarsen_mask(usable, 4.0)
-        inside = np.pad(coarse.hu >= 0.5, 1)
-        depth = ndimage.distance_transform_edt(inside, sampling=coarse.grid.spacing)[1:-1, 1:-1, 1:-1]
-        self._depth = Volume(depth.astype(np.float32), coarse.ras_from_ijk)
-
-    def __call__(self, points_ras: Array) -> Array:
-        ijk = self._depth.grid.to_ijk(points_ras).T
-        depth = ndimage.map_coordinates(self._depth.hu, ijk, order=1, mode="constant", cval=0.0)
-        return np.clip(depth / RIM_MM, 0.0, 1.0)
+def _deep_inside(usable: Mask, points_ras: Array) -> Array:
+    """Which points (n, 3) lie more than RIM_MM inside the region."""
+    coarse = coarsen_mask(usable, 4.0)
+    inside = np.pad(coarse.hu >= 0.5, 1)
+    depth = ndimage.distance_transform_edt(inside, sampling=coarse.grid.spacing)
+    ijk = coarse.grid.to_ijk(points_ras).T + 1
+    return np.asarray(ndimage.map_coordinates(depth, ijk, order=1, mode="constant", cval=0.0) > RIM_MM)

@@ -29,8 +29,9 @@ def prepare(case: Case, stages: Stages) -> Prepared:
     """Segment the CT and clean the cone-beam images. Raises InputRefused when one does not show what it should."""
     with stages.stage("CT lungs"):
         lungs = segment_lungs(case.ct, case.side, case.nodule.mask, case.nodule.centre_ras)
-        if case.hints.lung_mask_ct is not None:
-            lungs = replace(lungs, **{case.side: case.hints.lung_mask_ct})
+    hinted = case.hints.lung_mask_ct
+    if hinted is not None:
+        lungs = replace(lungs, left=hinted) if case.side == "left" else replace(lungs, right=hinted)
     with stages.stage("CBCT preparation"):
         inflated, deflated = prepare_cbct(case.cbct_inflated), prepare_cbct(case.cbct_deflated)
     with stages.stage("spines"):

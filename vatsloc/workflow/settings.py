@@ -18,17 +18,17 @@ class _Table(BaseModel):
 class RegistrationSettings(_Table):
     """Free-form deformation of phase 1. Lengths in mm; bending: weight of the bending energy, mm2."""
 
-    grid_mm: float = Field(16.0, ge=4, le=64)
-    levels: int = Field(4, ge=1, le=6)
-    voxel_mm: float = Field(2.0, ge=0.5, le=8)
-    window_mm: float | None = Field(14.0, gt=0)
-    bending: float = Field(100.0, gt=0)
+    grid_mm: float = Field(default=16.0, ge=4, le=64)
+    levels: int = Field(default=4, ge=1, le=6)
+    voxel_mm: float = Field(default=2.0, ge=0.5, le=8)
+    window_mm: float | None = Field(default=14.0, gt=0)
+    bending: float = Field(default=100.0, gt=0)
 
 
 class MeshSettings(_Table):
     """Finite-element lung. edge_mm: spacing of its tetrahedra."""
 
-    edge_mm: float = Field(8.0, ge=3, le=25)
+    edge_mm: float = Field(default=8.0, ge=3, le=25)
 
 
 class ModelSettings(_Table):
@@ -38,14 +38,14 @@ class ModelSettings(_Table):
     pose: bool = True
     hilum: bool = True
     diaphragm: bool = True
-    hilum_radius_mm: float = Field(15.0, gt=0)
-    max_steps: int = Field(30, ge=1)
+    hilum_radius_mm: float = Field(default=15.0, gt=0)
+    max_steps: int = Field(default=30, ge=1)
 
 
 class GateSettings(_Table):
     """Limits beyond which a result is marked as not to be trusted."""
 
-    min_overlap: float = Field(0.40, ge=0, le=1)
+    min_overlap: float = Field(default=0.40, ge=0, le=1)
     min_spine_ncc: float = 0.5
     min_spine_margin: float = 0.02
     max_folded_share: float = 0.0

@@ -1,0 +1,92 @@
+"""Synthetic cases as case folders: images, landmarks and truth in the files that every case has."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from phantoms.case import PhantomCase, make_case
+from phantoms.spec import SPECS
+from registration.volume import Array
+from vatsloc.errors import CaseError
+from vatsloc.formats.casefile import FILE_NAME
+from vatsloc.formats.folder import whole_folder
+from vatsloc.formats.markups import PointList, write_points
+from vatsloc.formats.nifti import write_mask, write_volume
+from vatsloc.workflow.stages import Say, quiet
+
+INFO_FILE = "truth/info.json"
+DENSE_HEADER = "ct_x,ct_y,ct_z,inf_x,inf_y,inf_z,def_x,def_y,def_z"
+
+
+def write_phantom(name: str, folder: Path, seed: int = 0, say: Say = quiet) -> None:
+    """Make the phantom called `name` and write it as a case folder, whole or not at all.
+
+    Raises CaseError for an unknown name, or where `folder` holds something else.
+    """
+    if name not in SPECS:
+        raise CaseError(f'"{name}" is no phantom; choose one of {", ".join(SPECS)}.')
+    say(f"phantom {name}, seed {seed} ...")
+    with whole_folder(folder, (FILE_NAME, INFO_FILE), _is_phantom) as partial:
+        _write(make_case(name, seed), partial)
+    say(f"phantom written to {folder}")
+
+
+def _is_phantom(folder: Path) -> bool:
+    return (folder / INFO_FILE).is_file() and (folder / FILE_NAME).read_text(encoding="utf-8").startswith("# phantom")
+
+
+def _write(phantom: PhantomCase, folder: Path) -> None:
+    truth = folder / "truth"
+    truth.mkdir()
+    write_volume(folder / "ct.nii.gz", phantom.ct)
+    write_volume(folder / "cbct_inflated.nii.gz", phantom.cbct_inflated)
+    write_volume(folder / "cbct_deflated.nii.gz", phantom.cbct_deflated)
+    write_mask(folder / "nodule.nii.gz", phantom.nodule)
+    write_points(folder / "nodule_ct.mrk.json", _nodule(phantom.nodule_ct))
+    write_points(truth / "nodule_cbct_inflated.mrk.json", _nodule(phantom.nodule_inflated))
+    write_points(truth / "nodule_cbct_deflated.mrk.json", _nodule(phantom.nodule_deflated))
+    for image, points in (
+        ("ct", phantom.landmarks_ct),
+        ("cbct_inflated", phantom.landmarks_inflated),
+        ("cbct_deflated", phantom.landmarks_deflated),
+    ):
+        labels = tuple(f"{n + 1}" for n in range(len(points)))
+        write_points(folder / f"landmarks_{image}.mrk.json", PointList(points, labels, ("",) * len(points)))
+    for name, mask in phantom.masks.items():
+        write_mask(truth / f"{name}.nii.gz", mask)
+    np.savetxt(
+        truth / "dense_ras_mm.csv", phantom.dense_truth, fmt="%.3f", delimiter=",", header=DENSE_HEADER, comments=""
+    )
+    (folder / INFO_FILE).write_text(json.dumps(phantom.info, indent=1) + "\n", encoding="utf-8")
+    (folder / FILE_NAME).write_text(_case_file(phantom), encoding="utf-8")
+
+
+def _nodule(point: Array) -> PointList:
+    return PointList(np.reshape(point, (1, 3)), ("nodule",), ("",))
+
+
+def _case_file(phantom: PhantomCase) -> str:
+    gravity = ", ".join(f"{g:.4f}" for g in phantom.gravity_cbct)
+    return f"""# phantom {phantom.spec.name}, seed {phantom.seed}
+side = "{phantom.side}"
+
+[images]
+ct = "ct.nii.gz"
+cbct_inflated = "cbct_inflated.nii.gz"
+cbct_deflated = "cbct_deflated.nii.gz"
+
+[nodule]
+mask = "nodule.nii.gz"
+
+[setup]
+gravity_cbct = [{gravity}]
+pleural_gas = "air"
+
+[landmarks]
+ct = "landmarks_ct.mrk.json"
+cbct_inflated = "landmarks_cbct_inflated.mrk.json"
+cbct_deflated = "landmarks_cbct_deflated.mrk.json"
+"""

@@ -1,0 +1,122 @@
+"""The whole method: prepare, change of pose, pneumothorax, and where the nodule is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from poro.fit import FitStatus, ellipsoid95
+from poro.model import PoroStatus
+from registration.spine import RigidFit
+from registration.volume import Array
+from vatsloc.case import Case
+from vatsloc.errors import NotConverged
+from vatsloc.imaging.surface import Border
+from vatsloc.maps import MeshMap
+from vatsloc.workflow.gates import Gate, at_least, at_most
+from vatsloc.workflow.hilum import HilumSource
+from vatsloc.workflow.pneumothorax import Collapse, pneumothorax
+from vatsloc.workflow.pose import ChangeOfPose, change_of_pose
+from vatsloc.workflow.prepare import Prepared, prepare
+from vatsloc.workflow.settings import GateSettings, Settings
+from vatsloc.workflow.stages import Stages
+
+
+@dataclass(frozen=True)
+class Localization:
+    """Where the nodule is, and everything that says why.
+
+    nodule_inf, nodule_def: (3,) RAS mm in the cone-beam CTs; ellipsoid_mm: (3,) semi-axes that hold it with 95 %,
+    longest first; ellipsoid_axes: (3, 3), their directions in rows.
+    """
+
+    prepared: Prepared
+    pose: ChangeOfPose
+    collapse: Collapse
+    nodule_inf: Array
+    nodule_def: Array
+    ellipsoid_mm: Array
+    ellipsoid_axes: Array
+    gates: dict[str, Gate]
+
+    @property
+    def def_from_inf(self) -> MeshMap:
+        """Inflated to deflated CBCT."""
+        moved = self.collapse.mesh_after.points
+        return MeshMap(self.pose.mesh_inf, moved, self.collapse.def_from_inf_rigid)
+
+    @property
+    def def_from_ct(self) -> MeshMap:
+        """CT to deflated CBCT."""
+        rigid = self.collapse.def_from_inf_rigid @ self.pose.inf_from_ct_rigid
+        return MeshMap(self.pose.mesh_ct, self.collapse.mesh_after.points, rigid)
+
+    @property
+    def status(self) -> str:
+        """ "done", or "gate failed"."""
+        return "done" if all(gate.ok for gate in self.gates.values()) else "gate failed"
+
+
+def localize(case: Case, settings: Settings, stages: Stages) -> Localization:
+    """Find the nodule of a case in its deflated cone-beam CT.
+
+    Raises InputRefused for images that do not show what they should, NotConverged when a solver has no answer.
+    """
+    prepared = prepare(case, stages)
+    pose = change_of_pose(case, prepared, settings, stages)
+    collapse = pneumothorax(case, prepared, pose, settings, stages)
+    if collapse.fit.state.status is PoroStatus.NOT_SETTLED or collapse.fit.status is FitStatus.CONTACT:
+        raise NotConverged("The contact of the collapsing lung did not settle; try another mesh edge_mm.")
+    nodule_inf = pose.inf_from_ct(case.nodule.centre_ras[None])[0]
+    rigid = collapse.def_from_inf_rigid
+    moved = MeshMap(pose.mesh_inf, collapse.mesh_after.points, rigid)
+    nodule_def = moved(nodule_inf[None])[0]
+    lengths, directions = ellipsoid95(collapse.fit, collapse.system, rigid(nodule_inf[None])[0])
+    gates = quality_gates(prepared, pose, collapse, settings.gates)
+    _note(pose, collapse, stages)
+    return Localization(prepared, pose, collapse, nodule_inf, nodule_def, lengths, directions.T, gates)
+
+
+def quality_gates(prepared: Prepared, pose: ChangeOfPose, collapse: Collapse, limits: GateSettings) -> dict[str, Gate]:
+    """Every check of a run, by name."""
+    gates: dict[str, Gate] = {}
+    for name, rigid in (("ct_inflated", pose.rigid), ("inflated_deflated", collapse.rigid)):
+        gates |= _spine_gates(name, rigid, limits)
+    pressure, fitted = collapse.fit.state.det_f, collapse.fit
+    seen = int(collapse.surface.only(Border.AIR).confidence.sum())
+    return gates | {
+        "overlap": at_least(pose.overlap, limits.min_overlap, "The inflated CBCT shows too little of the lung."),
+        "registration_folds": at_most(
+            pose.ffd.folded_share, limits.max_folded_share, "The registration of phase 1 folds space."
+        ),
+        "inverted_elements": at_most(
+            float((pressure <= 0).mean()), limits.max_inverted_elements, "The collapse turns elements inside out."
+        ),
+        "deflated_surface": at_least(seen, limits.min_surface_points, "Too little of the collapsed lung is seen."),
+        "surface_rms": at_most(
+            fitted.surface_rms_mm, limits.max_surface_rms_mm, "The model's surface stays off the observed one."
+        ),
+    }
+
+
+def _spine_gates(name: str, rigid: RigidFit, limits: GateSettings) -> dict[str, Gate]:
+    lead = rigid.ncc - rigid.runner_up_ncc
+    return {
+        f"spine_{name}": at_least(rigid.ncc, limits.min_spine_ncc, "The spines do not match."),
+        f"spine_slip_{name}": at_least(lead, limits.min_spine_margin, "The spine may have slipped by a vertebra."),
+    }
+
+
+def _note(pose: ChangeOfPose, collapse: Collapse, stages: Stages) -> None:
+    if collapse.motion.source in (HilumSource.SHIFT, HilumSource.STILL):
+        stages.warn(f"The hilum's motion comes from {collapse.motion.source.value}.")
+    if not collapse.found.is_collapsed:
+        stages.warn("The deflated CBCT shows hardly any pleural air, so the lung may not have collapsed.")
+    if pose.seen.all():
+        stages.skip("extrapolation", "the inflated CBCT shows the whole lung")
+    unsettled = collapse.fit.status
+    if unsettled is not FitStatus.CONVERGED:
+        stages.warn(f"The fit ended early: {unsettled.value}.")
+    if np.any(collapse.fit.state.conflicts):
+        stages.warn(f"{collapse.fit.state.conflicts} nodes were pushed behind the cage by the diaphragm.")

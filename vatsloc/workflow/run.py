@@ -1,0 +1,218 @@
+"""From a case folder to a results folder, whole or not at all."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from poro.mesh import TetMesh
+from registration.field import DisplacementField
+from registration.resample import resample, resample_mask
+from registration.spine import RigidFit
+from registration.volume import Array, Grid, Mask
+from vatsloc.case import Case, read_case
+from vatsloc.formats.folder import whole_folder
+from vatsloc.formats.meshes import Surface, TetraMesh
+from vatsloc.frames import flip_points
+from vatsloc.maps import sampled
+from vatsloc.report.collect import report_data
+from vatsloc.report.data import LUNG, SURFACE, Outline, Picture
+from vatsloc.report.render import write_report
+from vatsloc.results import OUTPUT_FILES, REPORT, ResultData, RunRecord, write_results
+from vatsloc.workflow.localize import Localization, localize
+from vatsloc.workflow.pneumothorax import contact_surface
+from vatsloc.workflow.settings import Settings
+from vatsloc.workflow.stages import Say, Stages, quiet
+
+FIELD_MARGIN_MM = 10.0
+
+
+def run_case(folder: Path, out: Path, settings: Settings, say: Say = quiet) -> dict[str, Any]:
+    """Localize the nodule of the case in `folder`, write everything to `out`, return what run.json holds.
+
+    Raises the errors of reading and of `localize`; `out` is then untouched.
+    """
+    stages = Stages(say)
+    with whole_folder(out, OUTPUT_FILES) as partial:
+        with stages.stage("read"):
+            case = read_case(folder)
+        for sentence in case.warnings:
+            stages.warn(sentence)
+        found = localize(case, settings, stages)
+        with stages.stage("warp"):
+            fields = _fields(case, found)
+        with stages.stage("write"):
+            result = _result(case, found, fields, _record(case, found, settings, stages))
+            write_results(partial, result)
+        with stages.stage("report"):
+            write_report(partial / REPORT, report_data(case, result, _pictures(case, found)))
+    return result.run.as_json()
+
+
+@dataclass(frozen=True)
+class _Fields:
+    """The run's maps on voxels: from the CT on the lung's box, to the CT on the grids of the cone-beam CTs."""
+
+    inflated_from_ct: DisplacementField
+    deflated_from_ct: DisplacementField
+    ct_from_inflated: DisplacementField
+    ct_from_deflated: DisplacementField
+
+
+def _fields(case: Case, found: Localization) -> _Fields:
+    """Inside the lung by the mesh; images outside it follow the spine."""
+    box = _lung_box(found.prepared.lung_ct)
+    inflated, deflated = found.pose.inf_from_ct, found.def_from_ct
+    return _Fields(
+        sampled(inflated, box),
+        sampled(deflated, box),
+        sampled(inflated.inverse(), case.cbct_inflated.grid, beyond=False),
+        sampled(deflated.inverse(), case.cbct_deflated.grid, beyond=False),
+    )
+
+
+def _result(case: Case, found: Localization, fields: _Fields, run: RunRecord) -> ResultData:
+    pose, collapse = found.pose, found.collapse
+    state, after = collapse.fit.state, collapse.mesh_after
+    outer, cage = after.boundary, contact_surface(collapse)
+    pose_det = pose.extrapolation.det_f
+    return ResultData(
+        nodule_inflated_ras=found.nodule_inf,
+        nodule_deflated_ras=found.nodule_def,
+        nodule_mask_deflated=_nodule_mask(case, fields),
+        ct_in_inflated=resample(case.ct, case.cbct_inflated.grid, fields.ct_from_inflated),
+        ct_in_deflated=resample(case.ct, case.cbct_deflated.grid, fields.ct_from_deflated),
+        lung_ct=_tetra(pose.mesh_ct, np.zeros_like(pose.points_inf), np.zeros(len(state.p)), np.ones(len(pose_det))),
+        lung_inflated=_tetra(pose.mesh_inf, pose.points_inf - pose.mesh_ct.points, np.zeros(len(state.p)), pose_det),
+        lung_deflated=_tetra(after, after.points - pose.points_inf, state.p, state.det_f, state.contact_pressure),
+        deflated_surface=Surface(outer.points, outer.triangles),
+        contact_surface=Surface(cage.points, cage.triangles),
+        inflated_from_ct=fields.inflated_from_ct,
+        deflated_from_ct=fields.deflated_from_ct,
+        ct_from_inflated=fields.ct_from_inflated,
+        ct_from_deflated=fields.ct_from_deflated,
+        rigid_inflated_from_ct=pose.inf_from_ct_rigid.matrix,
+        rigid_deflated_from_inflated=collapse.def_from_inf_rigid.matrix,
+        run=run,
+        stored_axes=case.stored_axes,
+    )
+
+
+def _tetra(
+    mesh: TetMesh, displacement: Array, pressure: Array, det_f: Array, contact_pressure: Array | None = None
+) -> TetraMesh:
+    """A state of the lung for viewers: mm, kPa."""
+    contact = np.zeros(len(mesh.points)) if contact_pressure is None else contact_pressure
+    nodal = {"displacement": displacement, "pressure_kpa": pressure, "contact_pressure_kpa": contact}
+    return TetraMesh(mesh.points, mesh.tets, nodal, {"det_f": det_f})
+
+
+def _lung_box(lung: Mask) -> Grid:
+    """The CT's grid about the lung."""
+    where = np.argwhere(lung.inside)
+    margin = np.ceil(FIELD_MARGIN_MM / lung.grid.spacing)
+    return lung.grid.box(where.min(axis=0) - margin, where.max(axis=0) + 1 + margin)
+
+
+def _nodule_mask(case: Case, fields: _Fields) -> Mask:
+    """The nodule in the deflated CBCT; a nodule known by its centre alone is taken as a ball of 5 mm radius."""
+    mask = case.nodule.mask
+    if mask is None:
+        mask = Mask(
+            np.linalg.norm(case.ct.grid.points() - case.nodule.centre_ras, axis=-1) <= 5.0, case.ct.ras_from_ijk
+        )
+    return resample_mask(mask, case.cbct_deflated.grid, fields.ct_from_deflated)
+
+
+def _record(case: Case, found: Localization, settings: Settings, stages: Stages) -> RunRecord:
+    theta = found.collapse.fit.theta
+    return RunRecord(
+        status=found.status,
+        nodule_lps=flip_points(found.nodule_def),
+        nodule_ellipsoid95_mm=found.ellipsoid_mm,
+        theta={"kappa_b": theta.kappa_b, "phi": theta.phi, "d_diaph_mm": theta.d_diaph_mm},
+        seconds={**stages.seconds, "total": stages.total_seconds},
+        peak_mb=max(stages.peak_mb.values()),
+        skipped=stages.skipped,
+        gates={name: gate.as_json() for name, gate in found.gates.items()},
+        warnings=tuple(stages.warnings),
+        details={
+            "nodule_ellipsoid95_axes_lps": flip_points(found.ellipsoid_axes),
+            "peak_mb_by_stage": dict(stages.peak_mb),
+            "seed": settings.seed,
+            "settings": settings.model_dump(),
+            "input_sha256": dict(case.input_sha256),
+            "side": case.side,
+            "gravity_ras": case.gravity_ras,
+            "residuals": _residuals(found),
+        },
+    )
+
+
+def _residuals(found: Localization) -> dict[str, Any]:
+    """What each solver left over, with its own word on how it ended."""
+    pose, collapse = found.pose, found.collapse
+    state = collapse.fit.state
+    return {
+        "spine_ct_inflated": {
+            "ncc": pose.rigid.ncc,
+            "runner_up": pose.rigid.runner_up_ncc,
+            "status": pose.rigid.status.value,
+        },
+        "spine_inflated_deflated": {
+            "ncc": collapse.rigid.ncc,
+            "runner_up": collapse.rigid.runner_up_ncc,
+            "status": collapse.rigid.status.value,
+        },
+        "free_form": {
+            "status": pose.ffd.status.value,
+            "min_det": pose.ffd.min_det,
+            "folded_share": pose.ffd.folded_share,
+        },
+        "inversion_mm": {"max_at_seen_nodes": pose.inversion.residual_mm[pose.seen].max(initial=0.0)},
+        "extrapolation": {
+            "status": pose.extrapolation.status.value,
+            "imposed_nodes": int(pose.seen.sum()),
+            "released_nodes": len(pose.extrapolation.released),
+            "min_det": pose.extrapolation.det_f.min(),
+        },
+        "hilum": {"source": collapse.motion.source.value, "mean_mm": collapse.motion.displacement.mean(axis=0)},
+        "fit": {
+            "status": collapse.fit.status.value,
+            "steps": len(collapse.fit.history),
+            "surface_rms_mm": collapse.fit.surface_rms_mm,
+            "contact_iterations": state.iterations,
+            "active_nodes": int(state.active.sum()),
+            "min_det": state.det_f.min(),
+            "volume_ratio": collapse.mesh_after.volumes.sum() / collapse.mesh_before.volumes.sum(),
+        },
+        "mesh": {"tetrahedra": len(pose.mesh_ct.tets), "nodes": len(pose.mesh_ct.points)},
+    }
+
+
+def _spine(fit: RigidFit) -> dict[str, Any]:
+    return {"ncc": fit.ncc, "runner_up": fit.runner_up_ncc, "overlap": fit.overlap, "status": fit.status.value}
+
+
+def _pictures(case: Case, found: Localization) -> tuple[Picture, ...]:
+    """Intermediate results that a reader should see before trusting the last one."""
+    prepared, collapse = found.prepared, found.collapse
+    return (
+        Picture(
+            "Inflated lung as segmented",
+            "Lung in the inflated CBCT, after its cupping was taken away; planes through the nodule.",
+            prepared.inflated.volume,
+            found.nodule_inf,
+            (Outline("inflated lung", LUNG, found.pose.lung_inf),),
+        ),
+        Picture(
+            "Collapsed lung as segmented",
+            "What the model is fitted to: the lung beside the pleural air in the deflated CBCT.",
+            prepared.deflated.volume,
+            found.nodule_def,
+            (Outline("collapsed lung", SURFACE, collapse.found.lung),),
+        ),
+    )
