@@ -81,7 +81,7 @@ def test_a_start_nearby_replaces_the_search() -> None:
     close = SpineSearch(shift_mm=10.0, angle_degrees=8.0, surroundings_mm=30.0)
     grid = fixed_grid(move)
     fit = register_spine(scene(grid, move), scene(MOVING), column(grid, move), initial=near, search=close)
-    assert_allclose(fit.moving_from_fixed(CENTRE[None]), move(CENTRE[None]), atol=0.4)
+    assert_allclose(fit.moving_from_fixed(CENTRE[None]), move(CENTRE[None]), atol=0.8)
 
 
 def test_nothing_in_common_is_called_poor() -> None:
