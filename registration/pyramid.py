@@ -46,6 +46,8 @@ class Pyramid:
 
 def cropped(fixed: Volume, mask: Mask, margin_mm: float = 8.0) -> tuple[Volume, Mask]:
     """Both restricted to the mask's bounding box and a margin."""
+    if not fixed.grid.same_as(mask.grid):
+        raise ValueError(f"the fixed mask must lie on the fixed image's grid: {mask!r} against {fixed!r}; resample it")
     where = np.argwhere(mask.inside)
     if len(where) == 0:
         raise ValueError("the fixed mask is empty; nothing to register, check the segmentation")

@@ -127,11 +127,14 @@ def test_a_heavy_prior_keeps_the_map_at_home() -> None:
     assert error(fit.moving_from_fixed(INNER), INNER).max() < 0.1
 
 
-def test_an_empty_mask_is_refused() -> None:
+def test_masks_that_are_empty_or_elsewhere_are_refused() -> None:
     blank = image_of(PATTERN, GRID)
     empty = Mask(np.zeros(GRID.shape, dtype=bool), GRID.ras_from_ijk)
     with pytest.raises(ValueError, match="mask is empty"):
         register_ffd(blank, blank, COARSE, fixed_mask=empty)
+    elsewhere = Mask(np.ones(WIDE.shape, dtype=bool), WIDE.ras_from_ijk)
+    with pytest.raises(ValueError, match="must lie on the fixed image's grid"):
+        register_ffd(blank, blank, COARSE, fixed_mask=elsewhere)
 
 
 def test_a_lung_slides_past_a_wall_that_stays() -> None:
