@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from poro.fit import Fit, FitSettings, fit
-from poro.mesh import TetMesh, TriSurface
+from poro.mesh import TetMesh, TriSurface, interpolate, locate, stuff
 from poro.model import PoroSystem, assemble
 from poro.observations import Target
 from poro.tissue import Tissue
@@ -33,8 +33,8 @@ from vatsloc.workflow.stages import Stages
 class Collapse:
     """The lung after its collapse, in the deflated CBCT's frame.
 
-    mesh_before, mesh_after: the same tetrahedra, placed by the spine and then collapsed; surface: what was seen of the
-    collapsed lung; hilum_nodes: (k,) held nodes.
+    mesh_before, points_after: the change of pose's tetrahedra, placed by the spine and then collapsed; system, fit: of
+    the model's own, coarser mesh; surface: what was seen of the collapsed lung; hilum_nodes: (k,) its held nodes.
     """
 
     rigid: RigidFit
@@ -44,6 +44,7 @@ class Collapse:
     hilum_nodes: Array
     motion: HilumMotion
     mesh_before: TetMesh
+    points_after: Array
     system: PoroSystem
     fit: Fit
 
@@ -55,7 +56,11 @@ class Collapse:
     @property
     def mesh_after(self) -> TetMesh:
         """The collapsed lung."""
-        return TetMesh(self.mesh_before.points + self.fit.state.u, self.mesh_before.tets)
+        return TetMesh(self.points_after, self.mesh_before.tets)
+
+    def on_lung(self, nodal: Array) -> Array:
+        """A nodal field of the model's mesh on the nodes of the lung's."""
+        return interpolate(locate(self.system.mesh, self.mesh_before.points), nodal)
 
 
 def pneumothorax(case: Case, prepared: Prepared, pose: ChangeOfPose, settings: Settings, stages: Stages) -> Collapse:
@@ -77,13 +82,16 @@ def pneumothorax(case: Case, prepared: Prepared, pose: ChangeOfPose, settings: S
         hilum_ct = find_hilum(prepared.lung_ct, prepared.lungs.airways, as_side(case.side))
         to_def = MeshMap(pose.mesh_ct, before.points, def_from_inf @ pose.inf_from_ct_rigid)
         hilum = Hilum(to_def(hilum_ct.point_ras[None])[0], hilum_ct.radius_mm, hilum_ct.on_airways)
-        nodes = _held(before, hilum.point_ras, settings.model.hilum_radius_mm)
-        motion = _motion(prepared, prior, hilum, def_from_inf, before.points[nodes], settings)
+        coarse = stuff(prepared.lung_ct.inside, prepared.lung_ct.ras_from_ijk, settings.mesh.model_edge_mm)
+        model_mesh = TetMesh(to_def(coarse.points), coarse.tets)
+        nodes = _held(model_mesh, hilum.point_ras, settings.model.hilum_radius_mm)
+        motion = _motion(prepared, prior, hilum, def_from_inf, model_mesh.points[nodes], settings)
     with stages.stage("model set-up"):
-        system = assemble(before, Tissue(), case.gravity_ras, nodes, motion.displacement)
+        system = assemble(model_mesh, Tissue(), case.gravity_ras, nodes, motion.displacement)
     with stages.stage("fit"):
-        result = fit(system, _target(surface), _fit_settings(settings), progress=None)
-    return Collapse(rigid, found, surface, hilum, nodes, motion, before, system, result)
+        result = fit(system, _target(surface), _fit_settings(settings))
+    after = before.points + interpolate(locate(model_mesh, before.points), result.state.u)
+    return Collapse(rigid, found, surface, hilum, nodes, motion, before, after, system, result)
 
 
 def contact_surface(collapse: Collapse) -> TriSurface:

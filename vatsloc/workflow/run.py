@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from poro.mesh import TetMesh
+from poro.mesh.tetmesh import signed_volumes
 from registration.field import DisplacementField
 from registration.resample import resample, resample_mask
 from registration.spine import RigidFit
@@ -77,6 +78,10 @@ def _fields(case: Case, found: Localization) -> _Fields:
 def _result(case: Case, found: Localization, fields: _Fields, run: RunRecord) -> ResultData:
     pose, collapse = found.pose, found.collapse
     state, after = collapse.fit.state, collapse.mesh_after
+    before = collapse.mesh_before
+    det_f = signed_volumes(after.points, after.tets) / before.volumes
+    pressure, contact = collapse.on_lung(np.column_stack([state.p, state.contact_pressure])).T
+    none = np.zeros(len(pressure))
     outer, cage = after.boundary, contact_surface(collapse)
     pose_det = pose.extrapolation.det_f
     return ResultData(
@@ -85,9 +90,9 @@ def _result(case: Case, found: Localization, fields: _Fields, run: RunRecord) ->
         nodule_mask_deflated=_nodule_mask(case, fields),
         ct_in_inflated=resample(case.ct, case.cbct_inflated.grid, fields.ct_from_inflated),
         ct_in_deflated=resample(case.ct, case.cbct_deflated.grid, fields.ct_from_deflated),
-        lung_ct=_tetra(pose.mesh_ct, np.zeros_like(pose.points_inf), np.zeros(len(state.p)), np.ones(len(pose_det))),
-        lung_inflated=_tetra(pose.mesh_inf, pose.points_inf - pose.mesh_ct.points, np.zeros(len(state.p)), pose_det),
-        lung_deflated=_tetra(after, after.points - pose.points_inf, state.p, state.det_f, state.contact_pressure),
+        lung_ct=_tetra(pose.mesh_ct, np.zeros_like(pose.points_inf), none, np.ones(len(pose_det)), none),
+        lung_inflated=_tetra(pose.mesh_inf, pose.points_inf - pose.mesh_ct.points, none, pose_det, none),
+        lung_deflated=_tetra(after, after.points - pose.points_inf, pressure, det_f, contact),
         deflated_surface=Surface(outer.points, outer.triangles),
         contact_surface=Surface(cage.points, cage.triangles),
         inflated_from_ct=fields.inflated_from_ct,
@@ -101,11 +106,8 @@ def _result(case: Case, found: Localization, fields: _Fields, run: RunRecord) ->
     )
 
 
-def _tetra(
-    mesh: TetMesh, displacement: Array, pressure: Array, det_f: Array, contact_pressure: Array | None = None
-) -> TetraMesh:
+def _tetra(mesh: TetMesh, displacement: Array, pressure: Array, det_f: Array, contact: Array) -> TetraMesh:
     """A state of the lung for viewers: mm, kPa."""
-    contact = np.zeros(len(mesh.points)) if contact_pressure is None else contact_pressure
     nodal = {"displacement": displacement, "pressure_kpa": pressure, "contact_pressure_kpa": contact}
     return TetraMesh(mesh.points, mesh.tets, nodal, {"det_f": det_f})
 
@@ -189,7 +191,7 @@ def _residuals(found: Localization) -> dict[str, Any]:
             "min_det": state.det_f.min(),
             "volume_ratio": collapse.mesh_after.volumes.sum() / collapse.mesh_before.volumes.sum(),
         },
-        "mesh": {"tetrahedra": len(pose.mesh_ct.tets), "nodes": len(pose.mesh_ct.points)},
+        "mesh": {"tetrahedra": len(pose.mesh_ct.tets), "model_tetrahedra": len(collapse.system.mesh.tets)},
     }
 
 

@@ -26,9 +26,12 @@ class RegistrationSettings(_Table):
 
 
 class MeshSettings(_Table):
-    """Finite-element lung. edge_mm: spacing of its tetrahedra."""
+    """Finite-element lung. edge_mm: of the tetrahedra that carry the maps; model_edge_mm: of those phase 2 is fitted
+    with, coarser because its error is the model's and not the mesh's.
+    """
 
     edge_mm: float = Field(default=8.0, ge=3, le=25)
+    model_edge_mm: float = Field(default=13.0, ge=4, le=25)
 
 
 class ModelSettings(_Table):
@@ -66,7 +69,10 @@ class Settings(_Table):
 
 
 PRESETS: dict[str, dict[str, Any]] = {
-    "fast": {"registration": {"grid_mm": 20.0, "levels": 3, "voxel_mm": 3.0}, "mesh": {"edge_mm": 11.0}},
+    "fast": {
+        "registration": {"grid_mm": 20.0, "levels": 3, "voxel_mm": 3.0},
+        "mesh": {"edge_mm": 10.0, "model_edge_mm": 16.0},
+    },
     "balanced": {},
 }
 

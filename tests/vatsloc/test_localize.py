@@ -1,0 +1,143 @@
+"""The main job on the demo phantom, from files to files."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from poro.mesh import TetMesh
+from registration.rigid import RigidTransform
+from vatsloc.case import read_case
+from vatsloc.evaluation import evaluate_case
+from vatsloc.formats.fields import read_field
+from vatsloc.formats.images import read_mask, read_volume
+from vatsloc.formats.markups import read_points
+from vatsloc.formats.meshes import read_vtu
+from vatsloc.formats.transforms import read_tfm
+from vatsloc.maps import MeshMap
+from vatsloc.phantom_case import write_phantom
+from vatsloc.results import OUTPUT_FILES
+from vatsloc.workflow.run import run_case
+from vatsloc.workflow.settings import load_settings
+
+TIMED = ("seconds", "peak_mb", "peak_mb_by_stage")
+
+
+@pytest.fixture(scope="module")
+def case(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("phantom") / "demo"
+    write_phantom("demo", folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def bare_case(case: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same case without landmarks and truth; case.toml still names the landmarks."""
+    folder = tmp_path_factory.mktemp("bare") / "demo"
+    shutil.copytree(case, folder)
+    shutil.rmtree(folder / "truth")
+    for path in folder.glob("landmarks_*"):
+        path.unlink()
+    return folder
+
+
+@pytest.fixture(scope="module")
+def result(case: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("result") / "demo"
+    run_case(case, folder, load_settings("fast", None))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def run(result: Path) -> dict[str, Any]:
+    return json.loads((result / "run.json").read_text(encoding="utf-8"))
+
+
+def test_every_output_is_there(result: Path) -> None:
+    assert sorted(path.name for path in result.iterdir()) == sorted(OUTPUT_FILES)
+
+
+def test_run_holds_the_agreed_keys(run: dict[str, Any]) -> None:
+    agreed = {"status", "nodule_lps", "nodule_ellipsoid95_mm", "theta", "seconds", "peak_mb", "skipped", "gates"}
+    assert agreed | {"warnings"} <= set(run)
+    assert set(run["theta"]) == {"kappa_b", "phi", "d_diaph_mm"}
+    assert all(set(gate) >= {"ok", "value", "limit"} for gate in run["gates"].values())
+    stages = {name: seconds for name, seconds in run["seconds"].items() if name != "total"}
+    assert run["seconds"]["total"] >= 0.9 * sum(stages.values())
+    longest_first = run["nodule_ellipsoid95_mm"]
+    assert longest_first == sorted(longest_first, reverse=True)
+    assert min(longest_first) > 0
+
+
+def test_chain_leaves_less_than_half_of_the_rigid_error(case: Path, result: Path, tmp_path: Path) -> None:
+    shutil.copytree(result, tmp_path / "r")
+    scores = evaluate_case(case, tmp_path / "r")
+    assert scores["phase1"]["mean"] < 1.0
+    assert scores["chain"]["mean"] < 0.5 * scores["rigid_ct_deflated"]["mean"]
+    assert scores["nodule_deflated_mm"] < 0.5 * scores["rigid_ct_deflated"]["mean"]
+
+
+def test_fields_meshes_and_nodule_tell_the_same(case: Path, result: Path, run: dict[str, Any]) -> None:
+    nodule_ct = read_case(case).nodule.centre_ras
+    nodule = read_points(result / "nodule_cbct_deflated.mrk.json").ras[0]
+    np.testing.assert_allclose(nodule * [-1, -1, 1], run["nodule_lps"], atol=1e-6)
+    forth = read_field(result / "from-CT_to-CBCTdeflated_mode-points_xfm.nii.gz")
+    back = read_field(result / "from-CBCTdeflated_to-CT_mode-image_xfm.nii.gz")
+    np.testing.assert_allclose(forth(nodule_ct[None])[0], nodule, atol=0.3)
+    np.testing.assert_allclose(back(nodule[None])[0], nodule_ct, atol=0.3)
+    mask = read_mask(result / "nodule_cbct_deflated.nii.gz")
+    centre = mask.grid.to_ras(np.argwhere(mask.inside).mean(axis=0))
+    np.testing.assert_allclose(centre, nodule, atol=1.5)
+    lungs = [read_vtu(result / f"lung_{state}.vtu") for state in ("ct", "inflated", "deflated")]
+    mesh = TetMesh(lungs[0].points_ras, lungs[0].tets)
+    to_inflated = read_tfm(result / "from-CT_to-CBCTinflated_mode-points_desc-rigid_xfm.tfm")
+    to_deflated = read_tfm(result / "from-CBCTinflated_to-CBCTdeflated_mode-points_desc-rigid_xfm.tfm")
+    chain = MeshMap(mesh, lungs[2].points_ras, RigidTransform(to_deflated @ to_inflated))
+    np.testing.assert_allclose(chain(nodule_ct[None])[0], nodule, atol=0.01)
+
+
+def test_warped_ct_looks_like_the_deflated_cbct_in_the_lung(case: Path, result: Path) -> None:
+    deflated = read_volume(case / "cbct_deflated.nii.gz")
+    warped = read_volume(result / "ct_in_cbct_deflated.nii.gz")
+    rigid = read_tfm(result / "from-CT_to-CBCTinflated_mode-points_desc-rigid_xfm.tfm")
+    assert warped.grid.same_as(deflated.grid)
+    assert np.linalg.det(rigid[:3, :3]) == pytest.approx(1.0)
+    cylinder = deflated.hu > -990
+    agreement = np.corrcoef(warped.hu[cylinder], deflated.hu[cylinder])[0, 1]
+    assert agreement > 0.8
+
+
+def test_landmarks_and_truth_change_nothing(bare_case: Path, result: Path, tmp_path: Path) -> None:
+    run_case(bare_case, tmp_path / "demo", load_settings("fast", None))
+    for name in OUTPUT_FILES:
+        if name not in ("run.json", "report.html"):
+            assert _digest(tmp_path / "demo" / name) == _digest(result / name), name
+    here, there = (json.loads((folder / "run.json").read_text()) for folder in (tmp_path / "demo", result))
+    assert {k: v for k, v in here.items() if k not in TIMED} == {k: v for k, v in there.items() if k not in TIMED}
+
+
+def test_a_killed_run_leaves_no_result(bare_case: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    command = [sys.executable, "-m", "vatsloc", "localize", str(bare_case), "--out", str(out), "--preset", "fast"]
+    moments = random.Random(5)
+    for _ in range(4):
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        time.sleep(moments.uniform(1.0, 12.0))
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        assert not out.exists()
+
+
+def _digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
