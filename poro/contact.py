@@ -87,20 +87,23 @@ def settle(
     active = start.active if start else np.zeros(len(free), bool)
     force = start.force if start else np.zeros(len(free))
     moves: list[float] = []
-    pivots, worst = 0, ContactStatus.SETTLED
+    pivots, pivoted, status = 0, False, ContactStatus.STOPPED
     while len(moves) < max_steps:
         gap, gradient, hessian = obstacle.gap(u, travel_mm)
         springs = curvature_springs(compliance, force, hessian)
         wall = Linearized(compliance, gap, gradient, u, free, springs)
         force, active, target, used, status = complementarity(wall, active)
         pivots += used
-        worst = max(worst, status, key=list(ContactStatus).index)
+        pivoted = pivoted or status is not ContactStatus.SETTLED
         moves.append(float(np.linalg.norm(target - u, axis=1).max(initial=0)))
         u = u + min(1.0, MAX_MOVE_MM / max(moves[-1], 1e-30)) * (target - u)
         if moves[-1] < tolerance_mm:
             break
     gap, gradient, hessian = obstacle.gap(u, travel_mm)
-    status = worst if moves[-1] < tolerance_mm else ContactStatus.STOPPED
+    if moves[-1] >= tolerance_mm:
+        status = ContactStatus.STOPPED
+    elif pivoted and status is not ContactStatus.STOPPED:
+        status = ContactStatus.PIVOTED
     return ContactState(u, force, gap, gradient, hessian, active, len(moves), pivots, tuple(moves), status)
 
 
@@ -171,7 +174,7 @@ class Linearized:
 
 
 def complementarity(
-    wall: Linearized, active: Array, max_pivots: int = 400
+    wall: Linearized, active: Array, max_pivots: int = 80
 ) -> tuple[Array, Array, Array, int, ContactStatus]:
     """Forces (nc,) >= 0 with linearized gap >= 0 and gap . force = 0, from a guessed active set (nc,) bool.
 

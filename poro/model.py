@@ -175,9 +175,14 @@ def solve(system: PoroSystem, theta: Theta, start: PoroState | None = None) -> P
         + system.mode_responses @ np.array(theta.modes)
     )
     nodes = system.contact_nodes
-    contact = settle(
-        system.compliance, system.obstacle, free[nodes], theta.d_diaph_mm, start.contact if start else None
-    )
+    wall = (system.compliance, system.obstacle)
+    contact = settle(*wall, free[nodes], theta.d_diaph_mm, start.contact if start else None)
+    if contact.status is ContactStatus.STOPPED:
+        # Very heavy or strongly sucked lungs slide too far for one linearization: load them in steps.
+        grown = None
+        for share in np.linspace(0.2, 1, 5):
+            grown = settle(*wall, share * free[nodes], share * theta.d_diaph_mm, grown)
+        contact = grown or contact
     force = np.zeros(shape)
     force[nodes] = contact.gradient * contact.force[:, None]
     u = free + system.solid.solve(force)
