@@ -54,7 +54,7 @@ class FfdSettings:
     noise_hu: float = 20.0
     mass_preserving: bool = False
     weights: Weights = field(default_factory=Weights)
-    steps: int = 15
+    steps: int = 30
 
 
 @dataclass(frozen=True)
