@@ -18,6 +18,9 @@ app = typer.Typer(
     help="Where is the nodule in the collapsed lung? CT + inflated CBCT + deflated CBCT in, position and report out.",
 )
 
+bench = typer.Typer(no_args_is_help=True, help="Measure a part of the product, beside other programs where installed.")
+app.add_typer(bench, name="bench")
+
 CaseArgument = Annotated[Path, typer.Argument(metavar="CASE", help="Case folder with case.toml.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout.")]
 
@@ -104,6 +107,20 @@ def demo(
     print(f"report: {(result / 'report.html').resolve()}")
     if failed:
         raise GateFailed(f"The demo's quality gates failed: {', '.join(failed)}.")
+
+
+@bench.command("poro")
+def bench_poro_command(
+    max_tets: Annotated[int, typer.Option(metavar="N", help="Largest mesh of the cost table.")] = 500_000,
+    as_json: JsonOption = False,
+) -> None:
+    """Poroelastic lung: seconds and memory against mesh size, displacements and speed beside GetFEM's."""
+    from vatsloc.study.bench_poro import SIZES, bench_poro, table
+
+    result = bench_poro(tuple(size for size in SIZES if size <= max_tets), say=say)
+    say(table(result))
+    if as_json:
+        show(result)
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -1,0 +1,62 @@
+"""Benchmark of the poroelastic lung: the other program agrees, and the tables hold what readers rely on."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from poro.tissue import Tissue
+from vatsloc.study import bench_poro as bench
+from vatsloc.study.getfem_peer import getfem_python
+from vatsloc.study.poro_lung import HILUM_CENTRE, RADII_MM, in_smooth_wall, lung, system_of, wall_level
+
+
+def test_getfem_gives_the_same_displacements() -> None:
+    if getfem_python() is None:
+        pytest.skip("GetFEM is not installed")
+    result = bench.compare_getfem(3_000, 4, lambda _: None)
+    assert result is not None
+    assert result["rel_diff_free"] < 1e-8
+    assert result["rel_diff_contact"] < 1e-4
+    assert min(result["active_nodes"]) > 20
+    json.dumps(result)
+
+
+def test_without_getfem_the_comparison_is_null(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bench, "getfem_python", lambda: None)
+    told: list[str] = []
+    assert bench.compare_getfem(3_000, 4, told.append) is None
+    assert "not installed" in told[0]
+    assert "no comparison" in bench.table({"sizes": [], "exponents": {"setup": None}, "getfem": None})
+
+
+@pytest.mark.parametrize("tets", [3_000, 12_000])
+def test_lung_has_the_size_and_hold_asked_for(tets: int) -> None:
+    body = lung(tets)
+    assert len(body.mesh.tets) == pytest.approx(tets, rel=0.25)
+    assert_allclose(wall_level(body.mesh.boundary.points), 0, atol=1.0)
+    assert np.linalg.norm(body.mesh.points[body.hilum] - HILUM_CENTRE, axis=1).max() < 22
+    assert (np.abs(body.mesh.points) < RADII_MM + 0.5).all()
+
+
+def test_sampled_wall_equals_its_expression() -> None:
+    system = in_smooth_wall(system_of(lung(2_000), Tissue()))
+    moved = system.obstacle.rest + np.random.default_rng(0).uniform(-8, 8, system.obstacle.rest.shape)
+    assert_allclose(system.obstacle.level.evaluate(moved)[0], wall_level(moved), atol=1e-3)
+
+
+def test_exponent_of_a_power_law() -> None:
+    rows = [{"tets": n, "setup_s": 3e-6 * n**1.4} for n in (5_000, 40_000, 300_000)]
+    assert bench.exponent(rows, "setup_s") == pytest.approx(1.4)
+    assert bench.exponent(rows[:1], "setup_s") is None
+
+
+def test_sweep_covers_the_range_of_a_fit() -> None:
+    vectors = np.array([theta.vector() for theta in bench.sweep_thetas()])
+    assert len(vectors) == 50
+    width = np.array([3, 0.27, 12])
+    assert_allclose(vectors.min(axis=0) / width, np.array([-10, 0.65, 0]) / width, atol=0.12)
+    assert_allclose(vectors.max(axis=0) / width, np.array([-7, 0.92, 12]) / width, atol=0.12)

@@ -1,0 +1,1 @@
+"""Benchmarks, stability studies, charts and cohorts: commands that measure the product."""
