@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command line does, before numpy is imported
+
 SHARED = Path(os.environ.get("VATSLOC_SHARED", Path(__file__).resolve().parents[2] / "shared"))
 
 

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+
+# Before numpy is first imported: the fronts of one lung are too small to share, and waiting threads burn the other core.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from vatsloc.errors import CaseError, GateFailed, VatslocError
 

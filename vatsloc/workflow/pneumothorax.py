@@ -25,6 +25,7 @@ from vatsloc.maps import MeshMap, covered, sampled
 from vatsloc.workflow.hilum import HilumMotion, HilumSource, hilum_motion
 from vatsloc.workflow.pose import ChangeOfPose, as_side
 from vatsloc.workflow.prepare import Prepared
+from vatsloc.workflow.residual import Residual, residual_registration
 from vatsloc.workflow.settings import Settings
 from vatsloc.workflow.stages import Stages
 
@@ -34,7 +35,8 @@ class Collapse:
     """The lung after its collapse, in the deflated CBCT's frame.
 
     mesh_before, points_after: the change of pose's tetrahedra, placed by the spine and then collapsed; system, fit: of
-    the model's own, coarser mesh; surface: what was seen of the collapsed lung; hilum_nodes: (k,) its held nodes.
+    the model's own, coarser mesh; residual: what images added to the model, in points_after already; surface: what was
+    seen of the collapsed lung; hilum_nodes: (k,) held nodes of the model.
     """
 
     rigid: RigidFit
@@ -47,6 +49,7 @@ class Collapse:
     points_after: Array
     system: PoroSystem
     fit: Fit
+    residual: Residual | None
 
     @property
     def def_from_inf_rigid(self) -> RigidTransform:
@@ -71,6 +74,8 @@ def pneumothorax(case: Case, prepared: Prepared, pose: ChangeOfPose, settings: S
             prepared.inflated.volume,
             prepared.spine_deflated.mask,
             prepared.spine_inflated.mask,
+            fixed_seen=prepared.deflated.field.usable,
+            moving_seen=prepared.inflated.field.usable,
         )
     def_from_inf = rigid.moving_from_fixed.inverse()
     before = TetMesh(def_from_inf(pose.points_inf), pose.mesh_ct.tets)
@@ -91,7 +96,17 @@ def pneumothorax(case: Case, prepared: Prepared, pose: ChangeOfPose, settings: S
     with stages.stage("fit"):
         result = fit(system, _target(surface), _fit_settings(settings))
     after = before.points + interpolate(locate(model_mesh, before.points), result.state.u)
-    return Collapse(rigid, found, surface, hilum, nodes, motion, before, after, system, result)
+    residual = None
+    if settings.residual.on:
+        with stages.stage("residual registration"):
+            model = MeshMap(pose.mesh_inf, after, def_from_inf)
+            residual = residual_registration(
+                prepared.inflated, prepared.deflated, found.lung, model, before, settings.residual
+            )
+        after = after if residual is None else after + residual.displacement
+    else:
+        stages.skip("residual registration", "switched off in the settings")
+    return Collapse(rigid, found, surface, hilum, nodes, motion, before, after, system, result, residual)
 
 
 def contact_surface(collapse: Collapse) -> TriSurface:

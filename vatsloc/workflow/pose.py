@@ -72,6 +72,7 @@ def change_of_pose(case: Case, prepared: Prepared, settings: Settings, stages: S
             prepared.spine_inflated.mask,
             prepared.spine_ct.mask,
             initial=_hinted(case),
+            fixed_seen=prepared.inflated.field.usable,
         )
     ct_from_inf_rigid, inf_from_ct_rigid = rigid.moving_from_fixed, rigid.moving_from_fixed.inverse()
     overlap = visible_share(prepared.lung_ct, prepared.inflated.field, inf_from_ct_rigid)

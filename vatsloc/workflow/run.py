@@ -25,6 +25,7 @@ from vatsloc.report.render import write_report
 from vatsloc.results import OUTPUT_FILES, REPORT, ResultData, RunRecord, write_results
 from vatsloc.workflow.localize import Localization, localize
 from vatsloc.workflow.pneumothorax import contact_surface
+from vatsloc.workflow.residual import Residual
 from vatsloc.workflow.settings import Settings
 from vatsloc.workflow.stages import Say, Stages, quiet
 
@@ -185,13 +186,26 @@ def _residuals(found: Localization) -> dict[str, Any]:
         "fit": {
             "status": collapse.fit.status.value,
             "steps": len(collapse.fit.history),
-            "surface_rms_mm": collapse.fit.surface_rms_mm,
+            "model_surface_rms_mm": collapse.fit.surface_rms_mm,
             "contact_iterations": state.iterations,
             "active_nodes": int(state.active.sum()),
             "min_det": state.det_f.min(),
             "volume_ratio": collapse.mesh_after.volumes.sum() / collapse.mesh_before.volumes.sum(),
         },
+        "residual_registration": _corrected(collapse.residual),
         "mesh": {"tetrahedra": len(pose.mesh_ct.tets), "model_tetrahedra": len(collapse.system.mesh.tets)},
+    }
+
+
+def _corrected(residual: Residual | None) -> dict[str, Any] | None:
+    if residual is None:
+        return None
+    return {
+        "seen_nodes": int(residual.seen.sum()),
+        "agreed_share": residual.agreed_share,
+        "model_error_mm": residual.model_error_mm,
+        "median_disagreement_mm": float(np.median(residual.disagreement_mm[residual.seen])),
+        "min_det": residual.min_det,
     }
 
 

@@ -22,7 +22,7 @@ class RegistrationSettings(_Table):
     levels: int = Field(default=4, ge=1, le=6)
     voxel_mm: float = Field(default=2.0, ge=0.5, le=8)
     window_mm: float | None = Field(default=14.0, gt=0)
-    bending: float = Field(default=100.0, gt=0)
+    bending: float = Field(default=300.0, gt=0)
 
 
 class MeshSettings(_Table):
@@ -45,6 +45,17 @@ class ModelSettings(_Table):
     max_steps: int = Field(default=30, ge=1)
 
 
+class ResidualSettings(_Table):
+    """Registration of the modelled lung to the observed one. Lengths in mm; bending: mm2."""
+
+    on: bool = True
+    grid_mm: float = Field(default=16.0, ge=6, le=64)
+    levels: int = Field(default=3, ge=1, le=5)
+    voxel_mm: float = Field(default=2.0, ge=0.5, le=8)
+    bending: float = Field(default=300.0, gt=0)
+    max_disagreement_mm: float = Field(default=3.0, gt=0)
+
+
 class GateSettings(_Table):
     """Limits beyond which a result is marked as not to be trusted."""
 
@@ -54,8 +65,12 @@ class GateSettings(_Table):
     max_folded_share: float = 0.0
     max_inversion_mm: float = 1.0
     max_inverted_elements: float = 0.01
-    max_surface_rms_mm: float = 6.0
+    max_surface_rms_mm: float = 5.0
     min_surface_points: int = 200
+    max_fissure_share: float = 0.1
+    min_agreement: float = 0.5
+    max_model_error_mm: float = 10.0
+    max_ellipsoid_mm: float = 15.0
 
 
 class Settings(_Table):
@@ -65,6 +80,7 @@ class Settings(_Table):
     registration: RegistrationSettings = RegistrationSettings()
     mesh: MeshSettings = MeshSettings()
     model: ModelSettings = ModelSettings()
+    residual: ResidualSettings = ResidualSettings()
     gates: GateSettings = GateSettings()
 
 

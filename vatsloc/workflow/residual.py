@@ -1,0 +1,113 @@
+"""What images say beyond the model: a registration of the modelled lung to the observed one, where both scans see it.
+
+The model brings tissue near enough for vessels to find themselves; alone, the same registration runs away on a
+collapsed lung. Two registrations, there and back, tell where the answer can be believed, and the lung carries it on.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+from poro.extrapolate import extrapolate
+from poro.mesh import TetMesh
+from poro.tissue import Tissue
+from registration.ffd import FfdSettings, Weights, register_ffd
+from registration.inversion import invert_at
+from registration.resample import resample, resample_mask
+from registration.volume import Array, Mask
+from vatsloc.imaging.cbct import PreparedCbct
+from vatsloc.imaging.lattice import dilate, erode
+from vatsloc.maps import MeshMap, covered, sampled
+from vatsloc.workflow.settings import ResidualSettings
+
+PRIOR_SPACING_MM = 3.0
+BORDER_MM = 2.0
+NEAR_REGION_MM = 4.0
+LEAST_NODES = 30
+
+
+@dataclass(frozen=True)
+class Residual:
+    """Correction of the modelled lung.
+
+    displacement: (n, 3) mm at the lung's nodes; compared: (n,) nodes where both images show lung; seen: (n,) those of
+    them whose correction is believed, all others follow elastically; disagreement_mm: (n,) between where the
+    registrations there and back put a node; min_det: least det of both maps' gradients.
+    """
+
+    displacement: Array
+    compared: Array
+    seen: Array
+    disagreement_mm: Array
+    min_det: float
+
+    @property
+    def agreed_share(self) -> float:
+        """Share of the compared nodes that both registrations put at the same place."""
+        return float(self.seen.sum() / max(self.compared.sum(), 1))
+
+    @property
+    def model_error_mm(self) -> float:
+        """Root mean square, per axis, of what the model was corrected by: how far off it is where nothing is seen."""
+        return float(np.sqrt(np.mean(self.displacement[self.seen] ** 2)))
+
+
+def residual_registration(
+    inflated: PreparedCbct,
+    deflated: PreparedCbct,
+    lung_def: Mask,
+    def_from_inf: MeshMap,
+    mesh_before: TetMesh,
+    settings: ResidualSettings,
+) -> Residual | None:
+    """Displacements that take the modelled nodes to where the images show their tissue; None where too little is seen.
+
+    lung_def: the collapsed lung as it was segmented; def_from_inf: the model's map; mesh_before: its undeformed mesh in
+    the deflated CBCT's frame.
+    """
+    grid = deflated.volume.grid
+    nodes = def_from_inf.moved
+    modelled = TetMesh(nodes, def_from_inf.mesh.tets)
+    prior = sampled(def_from_inf.inverse(), grid.with_spacing(PRIOR_SPACING_MM))
+    warped = resample(inflated.volume, grid, prior)
+    both_see = resample_mask(inflated.field.usable, grid, prior).inside & deflated.field.usable.inside
+    observed = _region(resample_mask(lung_def, grid).inside & both_see, deflated)
+    expected = _region(covered(modelled, grid).inside & both_see, deflated)
+    if not (observed.inside.any() and expected.inside.any()):
+        return None
+    ffd = FfdSettings(
+        spacing_mm=settings.grid_mm,
+        levels=settings.levels,
+        voxel_mm=settings.voxel_mm,
+        weights=Weights(bending=settings.bending),
+    )
+    seen_by_both = Mask(both_see, grid.ras_from_ijk)
+    there = register_ffd(deflated.volume, warped, ffd, fixed_mask=observed, moving_mask=seen_by_both)
+    back = register_ffd(warped, deflated.volume, ffd, fixed_mask=expected, moving_mask=seen_by_both)
+    inverse = invert_at(there.moving_from_fixed, nodes, nodes)
+    placed, other = inverse.points_fixed, back.moving_from_fixed(nodes)
+    disagreement = np.linalg.norm(placed - other, axis=1)
+    compared = _near(observed, placed) & _near(expected, nodes)
+    seen = compared & (inverse.residual_mm < 0.5) & (disagreement < settings.max_disagreement_mm)
+    if seen.sum() < LEAST_NODES:
+        return None
+    wanted = (placed + other) / 2 - nodes
+    chosen = np.flatnonzero(seen)
+    field = extrapolate(mesh_before, chosen, wanted[chosen], Tissue()).u
+    return Residual(field, compared, seen, disagreement, min(there.min_det, back.min_det))
+
+
+def _region(inside: Array, deflated: PreparedCbct) -> Mask:
+    """Where lungs are compared: a little inside their border, which air and wall blur."""
+    grid = deflated.volume.grid
+    return Mask(erode(inside, BORDER_MM, grid.spacing), grid.ras_from_ijk)
+
+
+def _near(region: Mask, points_ras: Array) -> Array:
+    """Which points (n, 3) lie in the region or just beside it."""
+    wide = dilate(region.inside, NEAR_REGION_MM, region.grid.spacing)
+    ijk = region.grid.to_ijk(points_ras).T
+    return np.asarray(ndimage.map_coordinates(wide.astype(np.uint8), ijk, order=0, mode="constant") > 0)
