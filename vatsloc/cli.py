@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-# Before numpy is first imported: the fronts of one lung are too small to share, and waiting threads burn the other core.
+# Before numpy is first imported: a lung's fronts are too small to share, and waiting threads burn the other core.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from vatsloc.errors import CaseError, GateFailed, VatslocError
