@@ -10,7 +10,7 @@ from registration.volume import Array
 from vatsloc.case import Case
 from vatsloc.formats.meshes import Surface, TetraMesh
 from vatsloc.frames import flip_points
-from vatsloc.report.data import LUNG, MESH, SURFACE, Comparison, Nodule, Outline, Picture, ReportData
+from vatsloc.report.data import LUNG, MESH, Comparison, Nodule, Outline, Picture, ReportData
 from vatsloc.results import ResultData, RunRecord
 
 
@@ -45,10 +45,7 @@ def report_data(case: Case, result: ResultData, pictures: tuple[Picture, ...] = 
             after_name="warped CT",
             after=result.ct_in_deflated,
             nodule=nodule,
-            outlines=(
-                Outline("deflated surface", SURFACE, result.deflated_surface),
-                Outline("lung model", LUNG, deflated),
-            ),
+            outlines=(Outline("lung model", LUNG, deflated),),
         ),
     )
     own = (

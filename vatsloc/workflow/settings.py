@@ -76,7 +76,6 @@ class GateSettings(_Table):
 class Settings(_Table):
     """Everything that shapes a result besides its inputs."""
 
-    seed: int = 0
     registration: RegistrationSettings = RegistrationSettings()
     mesh: MeshSettings = MeshSettings()
     model: ModelSettings = ModelSettings()

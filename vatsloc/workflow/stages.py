@@ -10,6 +10,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from vatsloc.errors import InputRefused
+
 Say = Callable[[str], None]
 
 
@@ -30,11 +32,17 @@ class Stages:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Time a block as the stage `name` and note the highest memory while it ran."""
+        """Time a block as the stage `name` and note the highest memory while it ran.
+
+        Numerics refuse what they cannot work with by a ValueError; it leaves as InputRefused that names the stage.
+        """
         self.say(f"{name} ...")
         reset = _reset_peak()
         start = time.perf_counter()
-        yield
+        try:
+            yield
+        except ValueError as error:
+            raise InputRefused(f"The stage '{name}' cannot work with these images: {error}.") from error
         self.seconds[name] = round(time.perf_counter() - start, 3)
         self.peak_mb[name] = round(_peak_mb(reset), 1)
         self.say(f"{name}: {self.seconds[name]:.1f} s")

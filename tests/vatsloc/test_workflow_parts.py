@@ -1,0 +1,132 @@
+"""Small parts of the workflow by value: maps, gates, stages, settings."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from poro.mesh import TetMesh, stuff_level_set
+from registration.rigid import RigidTransform
+from registration.volume import Grid
+from vatsloc.errors import CaseError, InputRefused
+from vatsloc.maps import MeshMap, covered, sampled
+from vatsloc.workflow.gates import at_least, at_most
+from vatsloc.workflow.pneumothorax import hand_placed
+from vatsloc.workflow.settings import load_settings
+from vatsloc.workflow.stages import Stages
+
+AROUND = RigidTransform.about(np.array([5.0, 0.0, 0.0]), np.array([0.0, 0.1, -0.2]), np.array([3.0, -4.0, 12.0]))
+
+
+def lattice(n: int, spacing: float, origin: tuple[float, float, float]) -> Grid:
+    """n^3 voxels along RAS."""
+    affine = np.diag([spacing, spacing, spacing, 1.0])
+    affine[:3, 3] = origin
+    return Grid((n, n, n), affine)
+
+
+@pytest.fixture(scope="module")
+def ball() -> TetMesh:
+    """Ball of 20 mm about (10, -5, 30)."""
+    centre = np.array([10.0, -5.0, 30.0])
+    return stuff_level_set(lambda x: 20.0 - np.linalg.norm(x - centre, axis=-1), centre - 22, centre + 22, 6.0)
+
+
+@pytest.fixture(scope="module")
+def squeeze(ball: TetMesh) -> MeshMap:
+    """The ball carried by AROUND and squeezed to 80 % along R about its image's centre."""
+    placed = AROUND(ball.points)
+    moved = placed.copy()
+    moved[:, 0] += 0.2 * (placed[:, 0].mean() - placed[:, 0])
+    return MeshMap(ball, moved, AROUND)
+
+
+def test_mesh_map_is_exact_for_an_affine_motion_inside(squeeze: MeshMap) -> None:
+    inside = np.array([[10.0, -5.0, 30.0], [18.0, -2.0, 25.0], [4.0, -12.0, 33.0]])
+    placed = AROUND(inside)
+    centre = AROUND(squeeze.mesh.points)[:, 0].mean()
+    expected = placed + np.column_stack([0.2 * (centre - placed[:, 0]), np.zeros((3, 2))])
+    np.testing.assert_allclose(squeeze(inside), expected, atol=1e-9)
+    np.testing.assert_allclose(squeeze.inverse()(expected), inside, atol=1e-9)
+
+
+def test_far_from_the_mesh_everything_moves_with_its_surroundings(squeeze: MeshMap) -> None:
+    far = np.array([[10.0, 200.0, 30.0]])
+    offset = squeeze(far) - AROUND(far)
+    assert np.linalg.norm(offset) < 0.2 * 21
+    np.testing.assert_allclose(offset[0, 1:], 0, atol=1e-9)
+
+
+def test_sampled_map_agrees_with_the_map(squeeze: MeshMap) -> None:
+    grid = Grid(
+        (24, 24, 24), np.diag([2.0, 2.0, 2.0, 1.0]) + np.array([[0, 0, 0, -14], [0, 0, 0, -29], [0, 0, 0, 6], [0] * 4])
+    )
+    inside = covered(squeeze.mesh, grid).inside
+    field = sampled(squeeze, grid)
+    points = grid.points()[inside]
+    np.testing.assert_allclose(points + field.vectors[inside], squeeze(points), atol=1e-4)
+    still = sampled(squeeze, grid, beyond=False)
+    outside = grid.points()[~inside]
+    np.testing.assert_allclose(outside + still.vectors[~inside], AROUND(outside), atol=1e-4)
+
+
+def test_covered_voxels_have_the_volume_of_the_mesh(ball: TetMesh) -> None:
+    grid = Grid(
+        (50, 50, 50), np.diag([1.0, 1.0, 1.0, 1.0]) + np.array([[0, 0, 0, -15], [0, 0, 0, -30], [0, 0, 0, 5], [0] * 4])
+    )
+    inside = covered(ball, grid).inside
+    assert inside.sum() == pytest.approx(ball.volumes.sum(), rel=0.01)
+    assert not covered(ball, lattice(5, 1.0, (500, 0, 0))).inside.any()
+
+
+def test_gates_know_their_side() -> None:
+    assert at_most(2.0, 2.0, "x").ok
+    assert not at_most(2.1, 2.0, "x").ok
+    assert at_least(0.5, 0.4, "x").ok
+    assert at_least(0.3, 0.4, "too small").as_json() == {"ok": False, "value": 0.3, "limit": 0.4, "says": "too small"}
+
+
+def test_a_gate_without_a_number_fails() -> None:
+    assert not at_most(float("nan"), 2.0, "x").ok
+    assert not at_least(float("nan"), 2.0, "x").ok
+
+
+def test_stages_are_timed_and_refusals_named() -> None:
+    said: list[str] = []
+    stages = Stages(said.append)
+    with stages.stage("one"):
+        pass
+    with (
+        pytest.raises(InputRefused, match="The stage 'two' cannot work with these images: empty mask"),
+        stages.stage("two"),
+    ):
+        raise ValueError("empty mask")
+    assert list(stages.seconds) == ["one"]
+    assert 0 <= stages.seconds["one"] <= stages.total_seconds
+    assert stages.peak_mb["one"] > 1
+    stages.skip("three", "nothing to do")
+    assert stages.skipped == {"three": "nothing to do"}
+    assert said[-1] == "three: skipped, nothing to do"
+
+
+def test_settings_file_overrides_the_preset_and_nothing_else(tmp_path: Path) -> None:
+    file = tmp_path / "s.toml"
+    file.write_text("[mesh]\nedge_mm = 9\n")
+    fast, mine = load_settings("fast", None), load_settings("fast", file)
+    assert mine.mesh.edge_mm == 9
+    assert mine.mesh.model_edge_mm == fast.mesh.model_edge_mm
+    assert mine.registration == fast.registration
+    file.write_text("[mesh]\nedge_mm = 900\n")
+    with pytest.raises(CaseError, match=r"mesh\.edge_mm"):
+        load_settings("fast", file)
+
+
+def test_hand_placed_points_look_away_from_the_lung() -> None:
+    corners = np.array([[0.0, 0, 0], [10, 0, 0], [0, 10, 0], [0, 0, 10]])
+    faces = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
+    for triangles in (faces, np.zeros((0, 3), dtype=int)):
+        placed = hand_placed(corners, triangles)
+        assert ((corners - corners.mean(axis=0)) * placed.normals).sum(axis=1).min() > 0
+        np.testing.assert_allclose(np.linalg.norm(placed.normals, axis=1), 1.0)
