@@ -127,6 +127,22 @@ def bench_poro_command(
         show(result)
 
 
+@bench.command("registration")
+def bench_registration_command(
+    cases: Annotated[
+        list[Path] | None, typer.Argument(metavar="CASES", help="Case folders; default: phantoms.")
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Phase 1: errors at the landmarks, seconds, memory and folding beside itk-elastix, and cost against image size."""
+    from vatsloc.study.bench_registration import bench_registration, table
+
+    result = bench_registration(cases or [], say=say)
+    say(table(result))
+    if as_json:
+        show(result)
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line; errors a user can act on become one sentence and an exit code."""
     try:

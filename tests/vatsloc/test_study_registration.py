@@ -1,0 +1,90 @@
+"""What the registration's studies measure, on values that are known."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from registration.field import DisplacementField
+from registration.rigid import RigidTransform
+from registration.volume import Mask, Volume
+from vatsloc.study import bench_registration as bench
+from vatsloc.study.bench_registration import Ours, bench_registration, score, table
+from vatsloc.study.cost_registration import Images, exponent
+from vatsloc.study.elastix import ElastixSettings, elastix_version, run_elastix
+from vatsloc.study.isolated import isolated
+
+AGREED = {"tre_mean", "tre_p95", "tre_max", "seconds", "peak_mb", "min_det", "folded_share"}
+AFFINE = np.diag([-2.0, -2.0, 2.0, 1.0])
+
+
+def blobs(shift_ras: tuple[float, float, float] = (0, 0, 0)) -> Volume:
+    """Soft balls in lung, moved by `shift_ras` mm."""
+    grid = Volume(np.zeros((36, 40, 32), dtype=np.float32), AFFINE).grid
+    points, hu = grid.points(), np.full(grid.shape, -850.0)
+    for centre in np.random.default_rng(4).uniform([-60, -66, 10], [-12, -12, 54], (14, 3)):
+        hu += 800 * np.exp(-np.sum((points - centre - shift_ras) ** 2, axis=-1) / (2 * 5.0**2))
+    return Volume(hu.astype(np.float32), AFFINE)
+
+
+@pytest.fixture
+def images() -> Images:
+    """A pair 3 mm apart along each axis, with the landmarks that say so."""
+    fixed, moving = blobs(), blobs((3, 3, 3))
+    everywhere = Mask(np.ones(fixed.hu.shape, dtype=bool), AFFINE)
+    marks = np.array([[-20.0, -30.0, 20.0], [-40.0, -50.0, 40.0]])
+    return Images(fixed, moving, everywhere, everywhere, everywhere, RigidTransform.identity(), marks, marks + 3.0)
+
+
+def test_score_of_a_known_shift(images: Images) -> None:
+    shift = np.zeros((*images.fixed.hu.shape, 3)) + np.array([3.0, 3.0, -1.0])
+    row = score(images, field := DisplacementField(shift, AFFINE), field)
+    assert [row[key] for key in ("tre_mean", "tre_p95", "tre_max", "n")] == pytest.approx([4.0, 4.0, 4.0, 2])
+    assert [row["min_det"], row["folded_share"]] == pytest.approx([1.0, 0.0])
+
+
+def test_score_counts_the_folded_half(images: Images) -> None:
+    vectors = np.zeros((*images.fixed.hu.shape, 3))
+    x = images.fixed.grid.points()[..., 0]
+    vectors[..., 0] = np.where(x < -34.0, -1.5 * (x + 34.0), 0.0)
+    field = DisplacementField(vectors, AFFINE)
+    row = score(images, field, field)
+    assert row["min_det"] == pytest.approx(-0.5)
+    assert row["folded_share"] == pytest.approx(18 / 36)
+
+
+def test_exponent_of_a_power_law() -> None:
+    rows = [{"voxels": n, "seconds": 3e-6 * n**0.8} for n in (1e5, 1e6, 1e7)]
+    assert exponent(rows, "seconds") == pytest.approx(0.8)
+
+
+def test_isolated_returns_values_and_errors() -> None:
+    assert isolated(divmod, 7, 3) == (2, 1)
+    with pytest.raises(ZeroDivisionError):
+        isolated(divmod, 7, 0)
+
+
+def test_without_elastix_its_row_is_null(images: Images, monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:
+    mine: dict[str, Any] = dict.fromkeys((*AGREED, "seconds_phase1", "seconds_cold", "seconds_spine"), 1.0)
+    cost = {"sizes": [], "exponent_seconds": 1.0, "exponent_mb": 1.0}
+    monkeypatch.setattr(bench, "elastix_version", lambda: None)
+    monkeypatch.setattr(bench, "isolated", lambda function, *_: Ours(mine, images))
+    monkeypatch.setattr(bench, "measure_cost", lambda _: cost)
+    result = bench_registration([tmp_path / "case"])
+    [case] = result["cases"]
+    assert (case["name"], case["elastix"]) == ("case", None)
+    assert set(case["ours"]) >= AGREED
+    assert case["rigid"]["tre_mean"] == pytest.approx(np.sqrt(27))
+    assert result["cost"] == cost
+    assert "itk-elastix is not installed" in table(result)
+
+
+@pytest.mark.skipif(elastix_version() is None, reason="itk-elastix is not installed")
+def test_elastix_finds_a_known_shift_by_value_and_sign(images: Images) -> None:
+    settings = ElastixSettings(grid_mm=24.0, levels=1, iterations=100, samples=1000)
+    run = isolated(run_elastix, images.fixed, blobs((4, -3, 2)), images.usable, settings)
+    middle = images.fixed.grid.to_ras(np.array([[18.0, 20.0, 16.0]]))
+    np.testing.assert_allclose(run.moving_from_fixed.displacement(middle)[0], [4, -3, 2], atol=0.4)
+    assert run.moving_from_fixed.grid.same_as(images.fixed.grid)
