@@ -60,12 +60,18 @@ class Grid:
 
     def box(self, lower_ijk: Array, upper_ijk: Array) -> Grid:
         """Sub-grid of voxels lower <= ijk < upper, clipped to this grid."""
+        cut = self.cut(lower_ijk, upper_ijk)
+        affine = self.ras_from_ijk.copy()
+        affine[:3, 3] = self.to_ras(np.array([float(span.start) for span in cut]))
+        i, j, k = (span.stop - span.start for span in cut)
+        return Grid((i, j, k), affine)
+
+    def cut(self, lower_ijk: Array, upper_ijk: Array) -> tuple[slice, slice, slice]:
+        """Where `box` lies in this grid's arrays."""
         lo = np.clip(np.floor(lower_ijk), 0, self.shape).astype(int)
         hi = np.clip(np.ceil(upper_ijk), lo, self.shape).astype(int)
-        affine = self.ras_from_ijk.copy()
-        affine[:3, 3] = self.to_ras(lo.astype(float))
-        n = hi - lo
-        return Grid((int(n[0]), int(n[1]), int(n[2])), affine)
+        i, j, k = (slice(int(a), int(b)) for a, b in zip(lo, hi, strict=True))
+        return i, j, k
 
     def same_as(self, other: Grid, tolerance_mm: float = 1e-3) -> bool:
         """Whether both grids have equal shapes and corners that agree within `tolerance_mm`."""

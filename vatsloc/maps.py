@@ -69,9 +69,8 @@ def covered(mesh: TetMesh, grid: Grid) -> Mask:
     return Mask(inside, grid.ras_from_ijk)
 
 
-def _box_of(mesh: TetMesh, grid: Grid) -> tuple[Grid, tuple[slice, ...]]:
+def _box_of(mesh: TetMesh, grid: Grid) -> tuple[Grid, tuple[slice, slice, slice]]:
     """The part of a grid that a mesh can reach, and where it lies in the grid."""
     ijk = grid.to_ijk(mesh.points)
-    box = grid.box(ijk.min(axis=0) - 1, ijk.max(axis=0) + 2)
-    start = np.rint(grid.to_ijk(box.ras_from_ijk[:3, 3])).astype(int)
-    return box, tuple(slice(a, a + n) for a, n in zip(start, box.shape, strict=True))
+    lower, upper = ijk.min(axis=0) - 1, ijk.max(axis=0) + 2
+    return grid.box(lower, upper), grid.cut(lower, upper)

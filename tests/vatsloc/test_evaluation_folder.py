@@ -123,6 +123,25 @@ def test_nodule_error_and_ellipsoid(folders):
     assert scores["nodule_in_ellipsoid95"] is True
 
 
+def test_dense_tissue_is_scored_where_a_phantom_knows_it(folders):
+    case, result = folders
+    assert evaluate_case(case, result)["dense"] is None
+    seen, far = CT, np.add(CT[:3], [0.0, 0, 500])  # the second lot lies outside every image
+    ct = np.concatenate([seen, far])
+    inflated = inflated_from_ct(ct) + PHASE1_ERROR
+    deflated = deflated_from_inflated(inflated) + PHASE2_ERROR
+    table_of = np.concatenate([ct, inflated, deflated], axis=1)
+    np.savetxt(case / "truth" / "dense_ras_mm.csv", table_of, delimiter=",", header="x", comments="")
+    dense = evaluate_case(case, result)["dense"]
+    assert_allclose([dense["inside_fov"]["phase1"][k] for k in ("mean", "max")], 1.0, atol=2e-3)
+    chain = np.linalg.norm(STRAIN2 @ PHASE1_ERROR + PHASE2_ERROR)
+    assert_allclose(dense["inside_fov"]["chain"]["mean"], chain, atol=4e-3)
+    assert dense["inside_fov"]["chain"]["n"] == len(CT)
+    (case / "truth" / "dense_ras_mm.csv").write_text("x\n1,2,3\n")
+    with pytest.raises(InputRefused, match="must hold 9 finite numbers a row"):
+        evaluate_case(case, result)
+
+
 def test_csv_rows_agree_with_the_summary(folders):
     case, result = folders
     scores = evaluate_case(case, result)

@@ -25,7 +25,7 @@ from vatsloc.formats.images import read_mask, read_volume
 from vatsloc.formats.markups import read_points
 from vatsloc.formats.meshes import read_vtu
 from vatsloc.formats.transforms import read_tfm
-from vatsloc.maps import MeshMap
+from vatsloc.maps import MeshMap, covered
 from vatsloc.phantom_case import write_phantom
 from vatsloc.results import OUTPUT_FILES
 from vatsloc.workflow.run import run_case
@@ -105,6 +105,27 @@ def test_fields_meshes_and_nodule_tell_the_same(case: Path, result: Path, run: d
     to_deflated = read_tfm(result / "from-CBCTinflated_to-CBCTdeflated_mode-points_desc-rigid_xfm.tfm")
     chain = MeshMap(mesh, lungs[2].points_ras, RigidTransform(to_deflated @ to_inflated))
     np.testing.assert_allclose(chain(nodule_ct[None])[0], nodule, atol=0.01)
+
+
+def test_pleural_gas_takes_the_place_of_the_lung(case: Path, result: Path) -> None:
+    warped = read_volume(result / "ct_in_cbct_deflated.nii.gz")
+    inflated = read_vtu(result / "lung_inflated.vtu")
+    rigid = RigidTransform(read_tfm(result / "from-CBCTinflated_to-CBCTdeflated_mode-points_desc-rigid_xfm.tfm"))
+    lung = read_mask(case / "truth" / "lung_deflated.nii.gz").inside
+    left = covered(TetMesh(rigid(inflated.points_ras), inflated.tets), warped.grid).inside & ~lung
+    assert left.sum() * warped.grid.spacing.prod() > 3e5
+    assert np.median(warped.hu[left]) == -1000
+    assert -930 < np.median(warped.hu[lung]) < -700
+
+
+def test_nodule_mask_covers_the_nodule_once(case: Path, result: Path) -> None:
+    found, truth = (
+        read_mask(result / "nodule_cbct_deflated.nii.gz"),
+        read_mask(case / "truth" / "nodule_deflated.nii.gz"),
+    )
+    assert found.grid.same_as(truth.grid)
+    dice = 2 * (found.inside & truth.inside).sum() / (found.inside.sum() + truth.inside.sum())
+    assert dice > 0.75
 
 
 def test_warped_ct_looks_like_the_deflated_cbct_in_the_lung(case: Path, result: Path) -> None:

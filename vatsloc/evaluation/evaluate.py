@@ -25,7 +25,7 @@ from vatsloc.evaluation.inputs import (
     seen_in,
 )
 from vatsloc.evaluation.landmarks import LandmarkTriples
-from vatsloc.evaluation.statistics import by_depth, signed_rank_p, summarize
+from vatsloc.evaluation.statistics import by_depth, distances, signed_rank_p, summarize
 from vatsloc.evaluation.tre import BEFORE, MEASURES, Errors, target_registration_errors
 from vatsloc.formats.folder import write_whole
 from vatsloc.frames import flip_points
@@ -84,6 +84,7 @@ def evaluate(truth: Truth, result: Result) -> Evaluation:
     }
     summary["inside_fov"] = {m: asdict(summarize(errors.mm[m][inside_fov])) for m in BEFORE}
     summary["by_depth"] = {m: _strata(errors.mm[m], depth) for m in BEFORE}
+    summary["dense"] = None if truth.dense is None else _dense(truth.dense, truth, result)
     summary["warnings"] = _warnings(landmarks, inside_fov, inside_mesh, inside_field)
     return Evaluation(landmarks, errors, depth, inside_fov, inside_mesh, _without_nan(summary))
 
@@ -120,6 +121,20 @@ def as_csv(scores: Evaluation) -> str:
         flags = [str(bool(flag[n])).lower() for flag in (scores.inside_fov, scores.inside_mesh)]
         table.writerow([label, *("" if math.isnan(v) else f"{v:.4f}" for v in numbers), *flags])
     return text.getvalue()
+
+
+def _dense(points: Array, truth: Truth, result: Result) -> dict[str, Any]:
+    """Errors at tissue points all over the lung, apart for those that both cone-beam CTs show and the others."""
+    ct, inflated, deflated = points[:, 0], points[:, 1], points[:, 2]
+    seen = seen_in(truth.fields_of_view["inflated"], inflated) & seen_in(truth.fields_of_view["deflated"], deflated)
+    errors = {
+        "phase1": distances(result.maps.inf_from_ct(ct), inflated),
+        "chain": distances(result.maps.def_from_ct(ct), deflated),
+    }
+    return {
+        where: {m: asdict(summarize(e[chosen])) for m, e in errors.items()}
+        for where, chosen in (("inside_fov", seen), ("outside_fov", ~seen))
+    }
 
 
 def _nodule(truth: Truth, result: Result) -> dict[str, Any]:

@@ -38,6 +38,8 @@ from vatsloc.results import (
     read_run,
 )
 
+DENSE_FILE = "dense_ras_mm.csv"
+
 
 @dataclass(frozen=True)
 class Result:
@@ -54,11 +56,16 @@ class Result:
 
 @dataclass(frozen=True)
 class Truth:
-    """What is known about a case. fields_of_view: by CBCT, "inflated" and "deflated"."""
+    """What is known about a case.
+
+    fields_of_view: by CBCT, "inflated" and "deflated"; dense: tissue points anywhere in the lung, where a phantom knows
+    them, in the three images (n, 3, 3) RAS mm.
+    """
 
     landmarks: LandmarkTriples
     nodule: Landmarks
     fields_of_view: dict[str, Mask]
+    dense: Array | None = None
 
 
 def read_truth(case: Path) -> Truth:
@@ -78,7 +85,19 @@ def read_truth(case: Path) -> Truth:
         "inflated": field_of_view(read_volume(case / images.cbct_inflated)).mask,
         "deflated": field_of_view(read_volume(case / images.cbct_deflated)).mask,
     }
-    return Truth(triples, known, seen)
+    return Truth(triples, known, seen, _dense(case / "truth" / DENSE_FILE))
+
+
+def _dense(path: Path) -> Array | None:
+    if not path.is_file():
+        return None
+    try:
+        table = np.loadtxt(path, delimiter=",", skiprows=1, ndmin=2)
+    except ValueError as error:
+        raise InputRefused(f"{path} is not a table of numbers ({error}); make the phantom again.") from error
+    if table.shape[1] != 9 or not np.isfinite(table).all():
+        raise InputRefused(f"{path} must hold 9 finite numbers a row (CT, inflated, deflated); make the phantom again.")
+    return table.reshape(-1, 3, 3)
 
 
 def read_result(folder: Path) -> Result:

@@ -7,6 +7,7 @@ from typing import Any
 
 from vatsloc.evaluation.tre import BEFORE, MEASURES
 
+_WHERE = {"inside_fov": "seen", "outside_fov": "unseen"}
 _COLUMNS = ("mean", "sd", "median", "p95", "max")
 
 
@@ -18,6 +19,10 @@ def table(summary: Mapping[str, Any]) -> str:
         numbers = "".join(f"{_mm(s[c]):>8}" for c in _COLUMNS)
         p = summary["wilcoxon_p"].get(measure) if measure in BEFORE else None
         lines.append(f"{measure:<26}{numbers}{s['n']:>6}" + ("" if p is None else f"  {p:.2g}"))
+    for where, errors in (summary.get("dense") or {}).items():
+        for measure, s in errors.items():
+            numbers = "".join(f"{_mm(s[c]):>8}" for c in _COLUMNS)
+            lines.append(f"{f'{measure}, tissue {_WHERE[where]}':<26}{numbers}{s['n']:>6}")
     inside = {True: ", inside its 95 % ellipsoid", False: ", outside its 95 % ellipsoid", None: ""}
     lines.append(
         f"nodule: {_mm(summary['nodule_inflated_mm'])} mm off in the inflated CBCT, "

@@ -13,12 +13,12 @@ from poro.mesh.tetmesh import signed_volumes
 from registration.field import DisplacementField
 from registration.resample import resample, resample_mask
 from registration.spine import RigidFit
-from registration.volume import Array, Grid, Mask
+from registration.volume import Array, Grid, Mask, Volume
 from vatsloc.case import Case, read_case
 from vatsloc.formats.folder import whole_folder
 from vatsloc.formats.meshes import Surface, TetraMesh
 from vatsloc.frames import flip_points
-from vatsloc.maps import sampled
+from vatsloc.maps import covered, sampled
 from vatsloc.report.collect import report_data
 from vatsloc.report.data import LUNG, SURFACE, Outline, Picture
 from vatsloc.report.render import write_report
@@ -30,6 +30,8 @@ from vatsloc.workflow.settings import Settings
 from vatsloc.workflow.stages import Say, Stages, quiet
 
 FIELD_MARGIN_MM = 10.0
+BALL_MM = 5.0
+GAS_HU = -1000.0
 SEED = 0
 """Of the spine's samples, the only thing drawn at random; fixed, so that a run can be repeated."""
 
@@ -90,9 +92,9 @@ def _result(case: Case, found: Localization, fields: _Fields, run: RunRecord) ->
     return ResultData(
         nodule_inflated_ras=found.nodule_inf,
         nodule_deflated_ras=found.nodule_def,
-        nodule_mask_deflated=_nodule_mask(case, fields),
+        nodule_mask_deflated=_nodule_mask(case, found),
         ct_in_inflated=resample(case.ct, case.cbct_inflated.grid, fields.ct_from_inflated),
-        ct_in_deflated=resample(case.ct, case.cbct_deflated.grid, fields.ct_from_deflated),
+        ct_in_deflated=_ct_in_deflated(case, found, fields),
         lung_ct=_tetra(pose.mesh_ct, np.zeros_like(pose.points_inf), none, np.ones(len(pose_det)), none),
         lung_inflated=_tetra(pose.mesh_inf, pose.points_inf - pose.mesh_ct.points, none, pose_det, none),
         lung_deflated=_tetra(after, after.points - pose.points_inf, pressure, det_f, contact),
@@ -122,14 +124,34 @@ def _lung_box(lung: Mask) -> Grid:
     return lung.grid.box(where.min(axis=0) - margin, where.max(axis=0) + 1 + margin)
 
 
-def _nodule_mask(case: Case, fields: _Fields) -> Mask:
-    """The nodule in the deflated CBCT; a nodule known by its centre alone is taken as a ball of 5 mm radius."""
-    mask = case.nodule.mask
+def _nodule_mask(case: Case, found: Localization) -> Mask:
+    """The nodule in the deflated CBCT; a nodule known by its centre alone is taken as a ball of 5 mm radius.
+
+    Only about the predicted centre: elsewhere the surroundings' rigid map would find the nodule a second time, in what
+    is now pleural air.
+    """
+    mask, grid = case.nodule.mask, case.cbct_deflated.grid
     if mask is None:
-        mask = Mask(
-            np.linalg.norm(case.ct.grid.points() - case.nodule.centre_ras, axis=-1) <= 5.0, case.ct.ras_from_ijk
-        )
-    return resample_mask(mask, case.cbct_deflated.grid, fields.ct_from_deflated)
+        ball = np.linalg.norm(case.ct.grid.points() - case.nodule.centre_ras, axis=-1) <= BALL_MM
+        mask = Mask(ball, case.ct.ras_from_ijk)
+    where = mask.grid.to_ras(np.argwhere(mask.inside))
+    reach = np.linalg.norm(where - case.nodule.centre_ras, axis=1).max() + FIELD_MARGIN_MM
+    at, margin = grid.to_ijk(found.nodule_def), reach / grid.spacing
+    box, cut = grid.box(at - margin, at + margin + 1), grid.cut(at - margin, at + margin + 1)
+    inside = np.zeros(grid.shape, dtype=bool)
+    if min(box.shape) > 0:
+        inside[cut] = resample_mask(mask, box, sampled(found.def_from_ct.inverse(), box)).inside
+    return Mask(inside, grid.ras_from_ijk)
+
+
+def _ct_in_deflated(case: Case, found: Localization, fields: _Fields) -> Volume:
+    """The CT as the collapsed lung shows it: what was lung and is not any more has become pleural gas."""
+    warped = resample(case.ct, case.cbct_deflated.grid, fields.ct_from_deflated)
+    left = (
+        covered(found.collapse.mesh_before, warped.grid).inside
+        & ~covered(found.collapse.mesh_after, warped.grid).inside
+    )
+    return Volume(np.where(left, np.float32(GAS_HU), warped.hu), warped.ras_from_ijk)
 
 
 def _record(case: Case, found: Localization, settings: Settings, stages: Stages) -> RunRecord:
