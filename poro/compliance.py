@@ -2,11 +2,28 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numba import njit
 
 from poro.mesh.tetmesh import Array
 from poro.solver import LinearSolver
+
+GROUPS = 128  # of contact nodes: about 2 cm of a lung's surface each
+
+
+@dataclass(frozen=True)
+class Groups:
+    """Contact nodes taken together.
+
+    label: (nc,) group; share: (g,) one over the nodes of a group; motion: (g, nc, 3, 3) displacements of all nodes
+    under a unit force spread over a group, by direction of the force (last).
+    """
+
+    label: Array
+    share: Array
+    motion: Array
 
 
 class Compliance:
@@ -22,6 +39,7 @@ class Compliance:
         self._place = np.full(len(unknowns), -1)
         self._blocks = np.zeros((0, len(unknowns), 3, 3))
         self._known = 0
+        self._groups: Groups | None = None
 
     @property
     def columns(self) -> int:
@@ -47,6 +65,19 @@ class Compliance:
             self._place[chunk] = self._known + np.arange(len(chunk))
             self._known += len(chunk)
 
+    def groups(self, points: Array) -> Groups:
+        """The nodes at points (nc, 3) in groups of neighbours; solved for once."""
+        if self._groups is None:
+            label = _bisect(points, GROUPS)
+            count = np.bincount(label)
+            right = np.zeros((self._size, len(count), 3))
+            for axis in range(3):
+                right[self._unknowns[:, axis], label, axis] = 1 / count[label]
+            u = self._solver.solve(right.reshape(self._size, -1))[self._unknowns]
+            motion = u.reshape(len(label), 3, len(count), 3).transpose(2, 0, 1, 3)
+            self._groups = Groups(label, 1 / count, np.ascontiguousarray(motion))
+        return self._groups
+
     def between(self, rows: Array, along: Array, columns: Array, push: Array) -> Array:
         """Motion (k, l) of contact nodes `rows` along (k, 3) under unit forces at nodes `columns` along push (l, 3)."""
         self.require(np.unique(columns))
@@ -57,6 +88,21 @@ class Compliance:
         columns = np.flatnonzero(force.any(axis=1))
         self.require(columns)
         return _apply(self._blocks, self._place[columns], force[columns])
+
+
+def _bisect(points: Array, groups: int) -> Array:
+    """Labels (n,) of points (n, 3) cut in two across the longest side again and again, into at most `groups`."""
+    label = np.zeros(len(points), np.int64)
+    pieces = [np.arange(len(points))]
+    while 2 * len(pieces) <= groups and min(len(piece) for piece in pieces) > 1:
+        halves = []
+        for piece in pieces:
+            order = piece[np.argsort(points[piece][:, np.argmax(np.ptp(points[piece], axis=0))], kind="stable")]
+            halves += [order[: len(order) // 2], order[len(order) // 2 :]]
+        pieces = halves
+    for number, piece in enumerate(pieces):
+        label[piece] = number
+    return label
 
 
 @njit(cache=True)

@@ -17,7 +17,7 @@ from poro.levelset import LevelSet
 from poro.mesh.tetmesh import Array
 
 GAP_TOLERANCE_MM = 1e-9
-SPRING_CUT = 0.02  # springs softer than this share of the stiffest wait for the next linearization
+SPRING_CUT = 1e-3  # springs softer than this share of the stiffest wait for the next linearization
 MAX_MOVE_MM = 20.0  # largest step over which a linearized wall is believed
 
 
@@ -90,7 +90,7 @@ def settle(
     pivots, pivoted, status = 0, False, ContactStatus.STOPPED
     while len(moves) < max_steps:
         gap, gradient, hessian = obstacle.gap(u, travel_mm)
-        springs = curvature_springs(compliance, force, hessian)
+        springs = group_springs(compliance, obstacle.rest, force, hessian)
         wall = Linearized(compliance, gap, gradient, u, free, springs)
         force, active, target, used, status = complementarity(wall, active)
         pivots += used
@@ -109,27 +109,38 @@ def settle(
 
 @dataclass(frozen=True)
 class Springs:
-    """Stiffness sum d v v' at single contact nodes, by which the wall's curvature turns the forces on sliding nodes.
+    """Stiffness by which the wall's curvature turns the forces on sliding nodes, each spring on a group's mean motion.
 
-    rows, along: (r,) nodes and (r, 3) directions v; strength: (r,) d in kPa mm, of either sign;
-    inverse: (r, r) of diag(1/d) + V' C V.
+    mean: (r, nc, 3) weights of the nodes' motion in a spring's stretch; motion: (r, nc, 3) displacements under a unit
+    force of every spring; inverse: (r, r) of diag(1/d) + mean . motion for strengths d in kPa mm of either sign.
     """
 
-    rows: Array
-    along: Array
-    strength: Array
+    mean: Array
+    motion: Array
     inverse: Array
 
 
-def curvature_springs(compliance: Compliance, force: Array, hessian: Array, cut: float = SPRING_CUT) -> Springs:
-    """Springs of forces (nc,) on a wall of Hessian (nc, 3, 3): a hollow wall steadies the nodes that press on it."""
-    nodes = np.flatnonzero(force)
-    values, vectors = np.linalg.eigh(-force[nodes, None, None] * hessian[nodes])
+def group_springs(compliance: Compliance, points: Array, force: Array, hessian: Array) -> Springs:
+    """Springs of forces (nc,) on a wall of Hessian (nc, 3, 3): a hollow wall steadies the nodes that press on it.
+
+    Only motions as long as a group feel the curvature as much as the tissue, so groups of nodes at points (nc, 3)
+    share three springs; what they miss the next linearization makes up.
+    """
+    groups = compliance.groups(points)
+    stiff = np.zeros((len(groups.share), 3, 3))
+    np.add.at(stiff, groups.label, -force[:, None, None] * hessian)
+    values, vectors = np.linalg.eigh(stiff)
     flat = values.ravel()
-    keep = np.abs(flat) > cut * np.abs(flat).max(initial=0)
-    rows, along, strength = np.repeat(nodes, 3)[keep], vectors.transpose(0, 2, 1).reshape(-1, 3)[keep], flat[keep]
-    matrix = compliance.between(rows, along, rows, along) + np.diag(1 / strength)
-    return Springs(rows, along, strength, inv(matrix) if len(rows) else matrix)
+    keep = np.abs(flat) > SPRING_CUT * np.abs(flat).max(initial=0)
+    which, along, strength = (
+        np.repeat(np.arange(len(stiff)), 3)[keep],
+        vectors.transpose(0, 2, 1).reshape(-1, 3)[keep],
+        flat[keep],
+    )
+    motion = np.einsum("rnab,rb->rna", groups.motion[which], along)
+    mean = (groups.label == which[:, None])[:, :, None] * along[:, None] * groups.share[which][:, None, None]
+    matrix = np.tensordot(mean, motion, axes=([1, 2], [1, 2])) + np.diag(1 / strength)
+    return Springs(mean, motion, inv(matrix) if len(which) else matrix)
 
 
 @dataclass(frozen=True)
@@ -148,15 +159,14 @@ class Linearized:
     @cached_property
     def anchor(self) -> Array:
         """Forces (r,) of the springs when no other contact force acts."""
-        pull = np.einsum("rd,rd->r", self.springs.along, (self.u - self.free)[self.springs.rows])
-        return self.springs.inverse @ pull
+        return self.springs.inverse @ np.tensordot(self.springs.mean, self.u - self.free, axes=2)
 
     def reduced(self, pool: Array) -> tuple[Array, Array, Array]:
         """Compliance (k, k) and gap (k,) of nodes `pool` with the springs eliminated, and how they load the springs
         (r, k).
         """
         n, s = self.gradient[pool], self.springs
-        coupling = self.compliance.between(s.rows, s.along, pool, n)
+        coupling = np.einsum("rkd,kd->rk", s.motion[:, pool], n)
         matrix = self.compliance.between(pool, n, pool, n) - coupling.T @ (s.inverse @ coupling)
         offset = self.gap[pool] + np.einsum("nd,nd->n", n, (self.free - self.u)[pool]) + coupling.T @ self.anchor
         return matrix, offset, coupling
@@ -165,12 +175,8 @@ class Linearized:
         """Displacements (nc, 3) under normal forces (k,) at nodes `pool`, springs included."""
         total = np.zeros_like(self.u)
         total[pool] = self.gradient[pool] * force[:, None]
-        np.add.at(
-            total,
-            self.springs.rows,
-            self.springs.along * (self.anchor - self.springs.inverse @ (coupling @ force))[:, None],
-        )
-        return self.free + self.compliance.apply(total)
+        pull = self.anchor - self.springs.inverse @ (coupling @ force)
+        return self.free + self.compliance.apply(total) + np.tensordot(pull, self.springs.motion, axes=1)
 
 
 def complementarity(
@@ -220,15 +226,26 @@ def contact_sensitivity(
     wall's curvature turns the forces as the nodes slide; normal and turning forces come from one symmetric system.
     """
     active = np.flatnonzero(state.active)
-    springs = curvature_springs(compliance, np.where(state.active, state.force, 0), state.hessian, 1e-4)
-    rows = np.concatenate([active, springs.rows])
-    direction = np.concatenate([state.gradient[active], springs.along])
+    sliding, along, strength = _node_springs(np.where(state.active, state.force, 0), state.hessian)
+    rows = np.concatenate([active, sliding])
+    direction = np.concatenate([state.gradient[active], along])
     result = np.zeros_like(free)
     if len(rows) == 0:
         return result
     matrix = compliance.between(rows, direction, rows, direction)
-    matrix += np.diag(np.concatenate([np.zeros(len(active)), 1 / springs.strength]))
+    matrix += np.diag(np.concatenate([np.zeros(len(active)), 1 / strength]))
     drift = -(obstacle.moving[:, None] * obstacle.axis)[:, :, None] * travel
     weight = -solve(matrix, np.einsum("rd,rdk->rk", direction, (free + drift)[rows]), assume_a="sym")
     np.add.at(result, rows, direction[:, :, None] * weight[:, None])
     return result
+
+
+def _node_springs(force: Array, hessian: Array, cut: float = 1e-4) -> tuple[Array, Array, Array]:
+    """Nodes (r,), directions (r, 3) and strengths (r,) kPa mm of the wall's curvature under forces (nc,), node by
+    node.
+    """
+    nodes = np.flatnonzero(force)
+    values, vectors = np.linalg.eigh(-force[nodes, None, None] * hessian[nodes])
+    flat = values.ravel()
+    keep = np.abs(flat) > cut * np.abs(flat).max(initial=0)
+    return np.repeat(nodes, 3)[keep], vectors.transpose(0, 2, 1).reshape(-1, 3)[keep], flat[keep]

@@ -162,8 +162,11 @@ def assemble(
     return PoroSystem(mesh, tissue, gravity, hilum, hilum_displacement, body, flow, obstacle, nodes, compliance, modes)
 
 
-def solve(system: PoroSystem, theta: Theta, start: PoroState | None = None) -> PoroState:
-    """Deflated lung at one parameter value; `start`, any earlier state of this system, only saves iterations."""
+def solve(system: PoroSystem, theta: Theta, start: PoroState | None = None, tolerance_mm: float = 1e-3) -> PoroState:
+    """Deflated lung at one parameter value; `start`, any earlier state of this system, only saves iterations.
+
+    tolerance_mm: largest last motion of a contact node.
+    """
     if len(theta.modes) != len(system.modes):
         raise ValueError(f"theta carries {len(theta.modes)} amplitudes, the system has {len(system.modes)} load modes")
     p, change = system.flow.pressure(theta.kappa_b)
@@ -176,12 +179,12 @@ def solve(system: PoroSystem, theta: Theta, start: PoroState | None = None) -> P
     )
     nodes = system.contact_nodes
     wall = (system.compliance, system.obstacle)
-    contact = settle(*wall, free[nodes], theta.d_diaph_mm, start.contact if start else None)
+    contact = settle(*wall, free[nodes], theta.d_diaph_mm, start.contact if start else None, tolerance_mm)
     if contact.status is ContactStatus.STOPPED:
         # Very heavy or strongly sucked lungs slide too far for one linearization: load them in steps.
         grown = None
         for share in np.linspace(0.2, 1, 5):
-            grown = settle(*wall, share * free[nodes], share * theta.d_diaph_mm, grown)
+            grown = settle(*wall, share * free[nodes], share * theta.d_diaph_mm, grown, tolerance_mm)
         contact = grown or contact
     force = np.zeros(shape)
     force[nodes] = contact.gradient * contact.force[:, None]

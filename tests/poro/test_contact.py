@@ -98,7 +98,7 @@ def test_active_set_equals_a_quadratic_program(seed: int) -> None:
     gradient = rng.normal(size=(n, 3))
     gradient /= np.linalg.norm(gradient, axis=1)[:, None]
     free = rng.normal(size=(n, 3))
-    none = Springs(np.zeros(0, int), np.zeros((0, 3)), np.zeros(0), np.zeros((0, 0)))
+    none = Springs(np.zeros((0, n, 3)), np.zeros((0, n, 3)), np.zeros((0, 0)))
     wall = Linearized(_Dense(dense), np.zeros(n), gradient, np.zeros((n, 3)), free, none)
     force, active, u, _, _ = complementarity(wall, rng.random(n) < 0.5)
     rows = np.zeros((3 * n, n))

@@ -20,7 +20,7 @@ def test_getfem_gives_the_same_displacements() -> None:
     result = bench.compare_getfem(3_000, 4, lambda _: None)
     assert result is not None
     assert result["rel_diff_free"] < 1e-8
-    assert result["rel_diff_contact"] < 1e-4
+    assert result["rel_diff_contact"] < 1e-3
     assert min(result["active_nodes"]) > 20
     json.dumps(result)
 
