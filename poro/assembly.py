@@ -35,6 +35,15 @@ def stiffness(mesh: TetMesh, lame: float | Array, shear: float | Array) -> csr_m
     return _scatter(mesh, local.reshape(-1, 12, 12), 3, 3)
 
 
+def tangent_stiffness(mesh: TetMesh, moduli: Array) -> csr_matrix:
+    """Integral of grad v : A : grad u, (3n, 3n) kPa mm, of moduli A (m, 3, 3, 3, 3) kPa by the displacement's
+    gradient.
+    """
+    half = np.einsum("mijkl,mbl->mijbk", moduli, mesh.gradients)
+    local = np.einsum("maj,mijbk,m->maibk", mesh.gradients, half, mesh.volumes, optimize=True)
+    return _scatter(mesh, local.reshape(-1, 12, 12), 3, 3)
+
+
 def laplacian(mesh: TetMesh) -> csr_matrix:
     """Integral of grad p . grad q, (n, n) mm."""
     return _scatter(mesh, np.einsum("mai,mbi,m->mab", mesh.gradients, mesh.gradients, mesh.volumes), 1, 1)

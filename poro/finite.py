@@ -1,0 +1,216 @@
+"""Lung at finite strain in front of a rigid wall: Newton with line search, load stepping and the active set of contact.
+
+Loads stay as large and directed as on the body at rest. Ref: Alvarez 2021, eqs. 12-14; Bonet & Wood 2008, ch. 9.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+from scipy.sparse import bsr_matrix, csr_matrix, diags
+
+from poro.assembly import deformation_gradient, eigenstress_load, tangent_stiffness
+from poro.contact import Obstacle
+from poro.laws import Law
+from poro.mesh.tetmesh import Array, TetMesh
+from poro.solver import linear_solver
+
+_SHRINK, _MAX_HALVINGS = 0.5, 12
+
+
+class FiniteStatus(Enum):
+    """How a finite-strain solution ended."""
+
+    SOLVED = "forces balance at finite strain"
+    STOPPED = "the load could not be raised further: Newton did not converge on the smallest load step"
+
+
+@dataclass(frozen=True)
+class Wall:
+    """Rigid wall in front of contact nodes (nc,), its moving part shifted by travel_mm."""
+
+    obstacle: Obstacle
+    nodes: Array
+    travel_mm: float
+
+
+@dataclass(frozen=True)
+class FiniteProblem:
+    """Body of one law, held at nodes `fixed` (k,) moved by imposed (k, 3) mm, under nodal forces load (n, 3) kPa
+    mm2.
+    """
+
+    mesh: TetMesh
+    law: Law
+    fixed: Array
+    imposed: Array
+    load: Array
+    wall: Wall | None = None
+
+
+@dataclass(frozen=True)
+class FiniteState:
+    """u: (n, 3) mm; force: (nc,) kPa mm2 along the gap's gradient; active: (nc,) bool; share: load carried, 1 when
+    solved; residuals: relative ones of every Newton step; load_steps: accepted ones.
+    """
+
+    u: Array
+    force: Array
+    active: Array
+    share: float
+    residuals: tuple[float, ...]
+    load_steps: int
+    status: FiniteStatus
+
+
+def deform(
+    problem: FiniteProblem, tolerance: float = 1e-8, max_newton: int = 25, min_step: float = 1 / 64
+) -> FiniteState:
+    """Raise the load in steps, halved when Newton fails and doubled when it does not, until all of it is carried."""
+    contacts = 0 if problem.wall is None else len(problem.wall.nodes)
+    u, force, active = np.zeros_like(problem.load), np.zeros(contacts), np.zeros(contacts, bool)
+    share, step, taken = 0.0, 0.25, 0
+    residuals: list[float] = []
+    while share < 1:
+        step = min(step, 1 - share)
+        tried = _newton(problem, share, share + step, (u, force, active), residuals, tolerance, max_newton)
+        if tried is not None:
+            u, force, active = tried
+            share, step, taken = share + step, 2 * step, taken + 1
+        else:
+            step /= 2
+            if step < min_step:
+                break
+    status = FiniteStatus.SOLVED if share >= 1 else FiniteStatus.STOPPED
+    return FiniteState(u, force, active, share, tuple(residuals), taken, status)
+
+
+def _gap(problem: FiniteProblem, u: Array, share: float) -> tuple[Array, Array, Array]:
+    if problem.wall is None:
+        return np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3, 3))
+    return problem.wall.obstacle.gap(u[problem.wall.nodes], share * problem.wall.travel_mm)
+
+
+def _newton(
+    problem: FiniteProblem,
+    before: float,
+    share: float,
+    start: tuple[Array, Array, Array],
+    residuals: list[float],
+    tolerance: float,
+    max_newton: int,
+) -> tuple[Array, Array, Array] | None:
+    """Displacement, contact forces and active set that carry `share` of the load, from those at `before`, or None."""
+    u, force, active = start
+    load = share * problem.load
+    jump = (share - before) * problem.imposed
+    nodes = np.zeros(0, int) if problem.wall is None else problem.wall.nodes
+    for _ in range(max_newton):
+        _, stress, moduli = problem.law.respond(deformation_gradient(problem.mesh, u))
+        unbalanced = load - eigenstress_load(problem.mesh, stress)
+        gap, gradient, hessian = _gap(problem, u, share)
+        matrix = tangent_stiffness(problem.mesh, moduli)
+        if len(nodes):
+            matrix = (matrix - _blocks(len(u), nodes, force[:, None, None] * hessian)).tocsr()
+        try:
+            change, pressed = _constrained_step(problem, matrix, unbalanced, (gap, gradient, active), jump)
+        except ValueError:
+            return None
+        force = np.where(active, pressed, 0)
+        length = _line_search(problem, u, change, load, share, force)
+        if length is None:
+            return None
+        u = u + length * change
+        jump = (1 - length) * jump
+        gap, gradient, _ = _gap(problem, u, share)
+        turned = (active & (force < 0)) | (~active & (gap < -1e-9))
+        active = active ^ turned
+        _, stress, _ = problem.law.respond(deformation_gradient(problem.mesh, u))
+        rest = load - eigenstress_load(problem.mesh, stress)
+        np.add.at(rest, nodes, gradient * force[:, None])
+        reaction = np.abs(rest[problem.fixed]).max(initial=0)
+        rest[problem.fixed] = 0
+        scale = max(float(np.abs(load).max()), float(reaction), float(np.abs(force).max(initial=0)), 1e-12)
+        residuals.append(float(np.abs(rest).max()) / scale)
+        if residuals[-1] < tolerance and not turned.any() and length == 1:
+            return u, force, active
+    return None
+
+
+def _blocks(count: int, nodes: Array, blocks: Array) -> csr_matrix:
+    """Sparse (3n, 3n) with 3x3 blocks (nc, 3, 3) on the diagonal at nodes (nc,)."""
+    full = np.zeros((count, 3, 3))
+    full[nodes] = blocks
+    return bsr_matrix((full, np.arange(count), np.arange(count + 1))).tocsr()
+
+
+def _constrained_step(
+    problem: FiniteProblem, matrix: csr_matrix, unbalanced: Array, contact: tuple[Array, Array, Array], jump: Array
+) -> tuple[Array, Array]:
+    """Newton step (n, 3) that closes the gap at active nodes and moves the held ones by `jump`; contact forces (nc,).
+
+    Active nodes are turned so that their first axis is the wall's normal, and that unknown is then imposed. Raises
+    ValueError when the tangent is not positive definite.
+    """
+    gap, gradient, active = contact
+    count = len(unbalanced)
+    nodes = np.zeros(0, int) if problem.wall is None else problem.wall.nodes
+    pressed = nodes[active]
+    steep = np.linalg.norm(gradient[active], axis=1)
+    frames = np.broadcast_to(np.eye(3), (count, 3, 3)).copy()
+    frames[pressed] = _frames(gradient[active] / steep[:, None])
+    turn = bsr_matrix((frames, np.arange(count), np.arange(count + 1))).tocsr()
+    turned = (turn @ matrix @ turn.T).tocsr()
+    imposed = np.zeros((count, 3))
+    imposed[pressed, 0] = -gap[active] / steep
+    imposed[problem.fixed] = jump
+    known = np.zeros((count, 3), bool)
+    known[pressed, 0] = True
+    known[problem.fixed] = True
+    free = diags((~known.ravel()).astype(float))
+    right = (turn @ unbalanced.ravel() - turned @ imposed.ravel()) * ~known.ravel()
+    scale = float(turned.diagonal().mean())
+    reduced = (free @ turned @ free + diags(scale * known.ravel())).tocsr()
+    change = linear_solver(reduced, problem.mesh.points).solve(right + scale * imposed.ravel() * known.ravel())
+    reaction = (turned @ change - turn @ unbalanced.ravel()).reshape(-1, 3)
+    force = np.zeros(len(nodes))
+    force[active] = reaction[pressed, 0] / steep
+    return (turn.T @ change).reshape(-1, 3), force
+
+
+def _frames(normals: Array) -> Array:
+    """Orthonormal rows (k, 3, 3) whose first is the given unit normal."""
+    axis = np.eye(3)[np.argmin(np.abs(normals), axis=1)]
+    second = np.cross(normals, axis)
+    second /= np.linalg.norm(second, axis=1)[:, None]
+    return np.stack([normals, second, np.cross(normals, second)], axis=1)
+
+
+def _line_search(
+    problem: FiniteProblem, u: Array, change: Array, load: Array, share: float, force: Array
+) -> float | None:
+    """Largest tried length at which energy plus penetration does not rise; None when every length raises it."""
+    sharp = 2 * float(np.abs(force).max(initial=0))
+    held = np.zeros(len(u), bool)
+    held[problem.fixed] = True
+
+    def merit(at: Array) -> float:
+        f = deformation_gradient(problem.mesh, at)
+        if not (np.linalg.det(f) > 0).all():
+            return np.inf
+        energy = float(problem.law.respond(f)[0] @ problem.mesh.volumes) - float((load * at).sum())
+        return energy + sharp * float(np.maximum(-_gap(problem, at, share)[0], 0).sum())
+
+    before = merit(u)
+    # A step that moves held nodes must be taken although it costs energy, so it is only kept from inverting elements.
+    moves_held = bool(np.abs(change[held]).max(initial=0) > 1e-12)
+    slack = 1e-9 * (abs(before) + 1)
+    length = 1.0
+    for _ in range(_MAX_HALVINGS):
+        value = merit(u + length * change)
+        if np.isfinite(value) and (moves_held or value <= before + slack):
+            return length
+        length *= _SHRINK
+    return None
