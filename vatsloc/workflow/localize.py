@@ -129,8 +129,10 @@ def quality_gates(pose: ChangeOfPose, collapse: Collapse, limits: GateSettings) 
             limits.max_fissure_share,
             "Lobes have come apart, but the lung is modelled in one piece.",
         ),
-        "surface_rms": at_most(
-            surface_rms(collapse), limits.max_surface_rms_mm, "The lung's surface stays off the observed one."
+        "surface": at_most(
+            float(np.median(surface_distances(collapse))),
+            limits.max_surface_mm,
+            "The lung's surface stays off the observed one.",
         ),
     }
     if collapse.residual is not None:
@@ -143,12 +145,12 @@ def quality_gates(pose: ChangeOfPose, collapse: Collapse, limits: GateSettings) 
     return gates
 
 
-def surface_rms(collapse: Collapse) -> float:
-    """Root mean square distance in mm of the observed air border from the collapsed mesh."""
+def surface_distances(collapse: Collapse) -> Array:
+    """Distances (n,) in mm of the observed air border from the collapsed mesh, one infinite one where none was seen."""
     points = collapse.surface.only(Border.AIR).points
     if len(points) == 0:
-        return float("inf")
-    return float(np.sqrt(np.mean(closest_points(collapse.mesh_after.boundary, points).distance ** 2)))
+        return np.array([np.inf])
+    return np.asarray(np.abs(closest_points(collapse.mesh_after.boundary, points).distance))
 
 
 def _spine_gates(name: str, rigid: RigidFit, limits: GateSettings) -> dict[str, Gate]:

@@ -23,7 +23,7 @@ from vatsloc.report.collect import report_data
 from vatsloc.report.data import LUNG, SURFACE, Outline, Picture
 from vatsloc.report.render import write_report
 from vatsloc.results import OUTPUT_FILES, REPORT, ResultData, RunRecord, write_results
-from vatsloc.workflow.localize import Localization, localize
+from vatsloc.workflow.localize import Localization, localize, surface_distances
 from vatsloc.workflow.pneumothorax import contact_surface
 from vatsloc.workflow.residual import Residual
 from vatsloc.workflow.settings import Settings
@@ -217,6 +217,7 @@ def _residuals(found: Localization) -> dict[str, Any]:
             "volume_ratio": collapse.mesh_after.volumes.sum() / collapse.mesh_before.volumes.sum(),
         },
         "residual_registration": _corrected(collapse.residual),
+        "surface_mm": {f"p{share}": np.percentile(surface_distances(collapse), share) for share in (50, 75, 90, 95)},
         "mesh": {"tetrahedra": len(pose.mesh_ct.tets), "model_tetrahedra": len(collapse.system.mesh.tets)},
     }
 
