@@ -1,6 +1,7 @@
 """Lung at finite strain in front of a rigid wall: Newton with line search, load stepping and the active set of contact.
 
-Loads stay as large and directed as on the body at rest. Ref: Alvarez 2021, eqs. 12-14; Bonet & Wood 2008, ch. 9.
+Weight stays as on the body at rest; the pressure's pull follows the deformed lung.
+Ref: Alvarez 2021, eqs. 12-14; Bonet & Wood 2008, ch. 9.
 """
 
 from __future__ import annotations
@@ -18,6 +19,8 @@ from poro.mesh.tetmesh import Array, TetMesh
 from poro.solver import linear_solver
 
 _SHRINK, _MAX_HALVINGS = 0.5, 12
+_MAX_SETS = 15
+_NEAR = 1e-2  # relative residual below which the full tangent is tried first
 
 
 class FiniteStatus(Enum):
@@ -38,8 +41,8 @@ class Wall:
 
 @dataclass(frozen=True)
 class FiniteProblem:
-    """Body of one law, held at nodes `fixed` (k,) moved by imposed (k, 3) mm, under nodal forces load (n, 3) kPa
-    mm2.
+    """Body of one law, held at nodes `fixed` (k,) moved by imposed (k, 3) mm, under nodal forces load (n, 3) kPa mm2
+    and suction (m,) kPa: how far alpha p in an element lies below its value at the surface.
     """
 
     mesh: TetMesh
@@ -48,6 +51,7 @@ class FiniteProblem:
     imposed: Array
     load: Array
     wall: Wall | None = None
+    suction: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -93,6 +97,24 @@ def _gap(problem: FiniteProblem, u: Array, share: float) -> tuple[Array, Array, 
     return problem.wall.obstacle.gap(u[problem.wall.nodes], share * problem.wall.travel_mm)
 
 
+def _respond(problem: FiniteProblem, f: Array, share: float) -> tuple[Array, Array, Array]:
+    """Energy, stress and moduli of the tissue and of `share` of the suction.
+
+    The force -alpha grad p of the deformed lung does the work of the suction q on the volume: energy q J.
+    """
+    energy, stress, moduli = problem.law.respond(f)
+    if problem.suction is None:
+        return energy, stress, moduli
+    q = share * problem.suction * np.linalg.det(f)
+    inverse = np.linalg.inv(f).transpose(0, 2, 1)
+    pairs = np.einsum("mij,mkl->mijkl", inverse, inverse)
+    return (
+        energy + q,
+        stress + q[:, None, None] * inverse,
+        moduli + q[:, None, None, None, None] * (pairs - pairs.transpose(0, 1, 4, 3, 2)),
+    )
+
+
 def _newton(
     problem: FiniteProblem,
     before: float,
@@ -107,36 +129,77 @@ def _newton(
     load = share * problem.load
     jump = (share - before) * problem.imposed
     nodes = np.zeros(0, int) if problem.wall is None else problem.wall.nodes
+    last = np.inf
     for _ in range(max_newton):
-        _, stress, moduli = problem.law.respond(deformation_gradient(problem.mesh, u))
+        _, stress, moduli = _respond(problem, deformation_gradient(problem.mesh, u), share)
         unbalanced = load - eigenstress_load(problem.mesh, stress)
         gap, gradient, hessian = _gap(problem, u, share)
-        matrix = tangent_stiffness(problem.mesh, moduli)
-        if len(nodes):
-            matrix = (matrix - _blocks(len(u), nodes, force[:, None, None] * hessian)).tocsr()
-        try:
-            change, pressed = _constrained_step(problem, matrix, unbalanced, (gap, gradient, active), jump)
-        except ValueError:
+        bend = -force[:, None, None] * hessian
+        # Far from balance the tangent may be indefinite; its convex part still descends.
+        for convex in (True,) if last > _NEAR else (False, True):
+            parts = (
+                (_convex(moduli.reshape(-1, 9, 9)).reshape(moduli.shape), _convex(bend)) if convex else (moduli, bend)
+            )
+            matrix = tangent_stiffness(problem.mesh, parts[0])
+            if len(nodes):
+                matrix = (matrix + _blocks(len(u), nodes, parts[1])).tocsr()
+            step = _linearized_contact(problem, matrix, unbalanced, (gap, gradient, active), jump)
+            if step is not None:
+                break
+        else:
             return None
-        force = np.where(active, pressed, 0)
+        change, force, active = step
         length = _line_search(problem, u, change, load, share, force)
         if length is None:
             return None
         u = u + length * change
         jump = (1 - length) * jump
         gap, gradient, _ = _gap(problem, u, share)
-        turned = (active & (force < 0)) | (~active & (gap < -1e-9))
-        active = active ^ turned
-        _, stress, _ = problem.law.respond(deformation_gradient(problem.mesh, u))
+        behind = ~active & (gap < -1e-6)
+        _, stress, _ = _respond(problem, deformation_gradient(problem.mesh, u), share)
         rest = load - eigenstress_load(problem.mesh, stress)
         np.add.at(rest, nodes, gradient * force[:, None])
-        reaction = np.abs(rest[problem.fixed]).max(initial=0)
+        reaction = rest[problem.fixed]
         rest[problem.fixed] = 0
-        scale = max(float(np.abs(load).max()), float(reaction), float(np.abs(force).max(initial=0)), 1e-12)
-        residuals.append(float(np.abs(rest).max()) / scale)
-        if residuals[-1] < tolerance and not turned.any() and length == 1:
+        pulls = (float(np.abs(part).max(initial=0)) for part in (load, reaction, force))
+        scale = max(*pulls, share * _pull_of_suction(problem), 1e-12)
+        last = float(np.abs(rest).max()) / scale
+        residuals.append(last)
+        if last < tolerance and not behind.any() and length == 1:
             return u, force, active
     return None
+
+
+def _pull_of_suction(problem: FiniteProblem) -> float:
+    """Nodal force that the suction exerts where it varies, kPa mm2: it balances itself, so reactions do not show it."""
+    if problem.suction is None:
+        return 0.0
+    return float(np.abs(problem.suction).max() * np.cbrt(problem.mesh.volumes.mean()) ** 2)
+
+
+def _linearized_contact(
+    problem: FiniteProblem, matrix: csr_matrix, unbalanced: Array, contact: tuple[Array, Array, Array], jump: Array
+) -> tuple[Array, Array, Array] | None:
+    """Step, contact forces >= 0 and active set of the linearized problem; None when it has no lowest energy."""
+    gap, gradient, active = contact
+    nodes = np.zeros(0, int) if problem.wall is None else problem.wall.nodes
+    for _ in range(_MAX_SETS):
+        try:
+            change, force = _constrained_step(problem, matrix, unbalanced, (gap, gradient, active), jump)
+        except ValueError:
+            return None
+        ahead = gap + np.einsum("nd,nd->n", gradient, change[nodes])
+        turned = (active & (force < 0)) | (~active & (ahead < -1e-9))
+        if not turned.any():
+            break
+        active = active ^ turned
+    return change, np.maximum(force, 0), active
+
+
+def _convex(matrices: Array) -> Array:
+    """Symmetric matrices (m, k, k) with their negative eigenvalues set to zero."""
+    values, vectors = np.linalg.eigh(matrices)
+    return (vectors * np.maximum(values, 0)[:, None]) @ vectors.transpose(0, 2, 1)
 
 
 def _blocks(count: int, nodes: Array, blocks: Array) -> csr_matrix:
@@ -200,7 +263,7 @@ def _line_search(
         f = deformation_gradient(problem.mesh, at)
         if not (np.linalg.det(f) > 0).all():
             return np.inf
-        energy = float(problem.law.respond(f)[0] @ problem.mesh.volumes) - float((load * at).sum())
+        energy = float(_respond(problem, f, share)[0] @ problem.mesh.volumes) - float((load * at).sum())
         return energy + sharp * float(np.maximum(-_gap(problem, at, share)[0], 0).sum())
 
     before = merit(u)

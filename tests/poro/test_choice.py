@@ -1,0 +1,92 @@
+"""Which model runs, why, and that the finite-strain lung is in balance with its suction, weight and wall."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from shapes import ellipsoid
+
+from poro.assembly import deformation_gradient
+from poro.choice import Model, Range, finite_problem, solve_in_range
+from poro.finite import FiniteProblem, FiniteStatus, deform
+from poro.laws import neo_hookean
+from poro.model import PoroSystem, Theta, assemble, solve
+from poro.modes import hilum_modes
+from poro.solid import solid
+from poro.tissue import Tissue
+
+TISSUE = Tissue()
+LAW = neo_hookean(TISSUE)
+
+
+@pytest.fixture(scope="module")
+def system() -> PoroSystem:
+    mesh = ellipsoid(16.0)
+    held = np.flatnonzero(np.linalg.norm(mesh.points - [-30, 0, 0], axis=1) < 16)
+    return assemble(mesh, TISSUE, np.array([-1.0, 0, 0]), held, np.broadcast_to([1.0, 0, 2.0], (len(held), 3)))
+
+
+def test_suction_at_small_load_is_the_pressure_gradients_linear_force(system: PoroSystem) -> None:
+    """Integral of q div v equals that of -alpha grad p . v, for p with its surface value on the whole surface."""
+    p, _ = system.flow.pressure(1e-8)
+    suction = TISSUE.pleural_kpa - p[system.mesh.tets].mean(axis=1)
+    still = np.zeros_like(system.hilum_displacement)
+    small = 1e-4
+    problem = FiniteProblem(
+        system.mesh, LAW, system.hilum, still, np.zeros_like(system.mesh.points), None, small * suction
+    )
+    linear = solid(system.mesh, TISSUE, system.hilum).solve((system.pressure_load @ p).reshape(-1, 3))
+    state = deform(problem)
+    assert_allclose(state.u / small, linear, atol=1e-3 * np.abs(linear).max())
+
+
+def test_free_body_under_uniform_suction_shrinks_by_the_closed_form() -> None:
+    """F = s I: mu (s - 1 / s) + 3 lambda ln s / s + q s^2 = 0."""
+    lame, mu, s = TISSUE.lame_kpa, TISSUE.shear_kpa, 0.8
+    q = -(mu * (s - 1 / s) + 3 * lame * np.log(s) / s) / s**2
+    mesh = ellipsoid(18.0)
+    held = np.flatnonzero(mesh.points[:, 2] < -40)
+    exact = (s - 1) * mesh.points
+    problem = FiniteProblem(mesh, LAW, held, exact[held], 0 * exact, None, np.full(len(mesh.tets), q))
+    state = deform(problem)
+    assert q > 0
+    assert state.status is FiniteStatus.SOLVED
+    assert_allclose(state.u, exact, atol=1e-6)
+
+
+def test_gentle_lungs_stay_linear_and_say_so(system: PoroSystem) -> None:
+    chosen = solve_in_range(system, Theta(1e-10, 0.9), LAW)
+    assert chosen.model is Model.LINEAR
+    assert chosen.finite is None
+    assert chosen.why.startswith("linear strain: 0.00 %")
+    assert_allclose(chosen.state.u, solve(system, Theta(1e-10, 0.9)).u, atol=1e-2)
+
+
+def test_collapsed_lungs_go_finite_and_hold_signorini(system: PoroSystem) -> None:
+    theta = Theta(1e-6, 0.5, 4.0)
+    chosen = solve_in_range(system, theta, LAW, Range(min_det=0.5))
+    state = chosen.state
+    assert chosen.model is Model.FINITE
+    assert chosen.why.startswith("neo-Hookean:")
+    assert state.det_f.min() > 0.05
+    assert_allclose(state.det_f, np.linalg.det(deformation_gradient(system.mesh, state.u)))
+    assert state.gap[system.contact_nodes].min() > -1e-6
+    assert (state.contact_pressure >= 0).all()
+    assert_allclose(state.gap[state.contact_pressure > 0], 0, atol=1e-6)
+    assert chosen.finite is not None
+    assert chosen.finite.residuals[-1] < 1e-8
+    assert state.det_f @ system.mesh.volumes > solve(system, theta).det_f @ system.mesh.volumes
+
+
+def test_load_modes_are_refused(system: PoroSystem) -> None:
+    with_modes = assemble(
+        system.mesh,
+        TISSUE,
+        system.gravity,
+        system.hilum,
+        system.hilum_displacement,
+        hilum_modes(system.mesh, system.hilum)[:1],
+    )
+    with pytest.raises(ValueError, match="no load modes"):
+        finite_problem(with_modes, Theta(1e-9, 0.8, 0.0, (0.0,)), LAW)
