@@ -24,6 +24,8 @@ app = typer.Typer(
 
 bench = typer.Typer(no_args_is_help=True, help="Measure a part of the product, beside other programs where installed.")
 app.add_typer(bench, name="bench")
+stability = typer.Typer(no_args_is_help=True, help="Show where a part of the product stops being right.")
+app.add_typer(stability, name="stability")
 
 CaseArgument = Annotated[Path, typer.Argument(metavar="CASE", help="Case folder with case.toml.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout.")]
@@ -125,6 +127,17 @@ def bench_poro_command(
     say(table(result))
     if as_json:
         show(result)
+
+
+@stability.command("poro")
+def stability_poro_command(
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for CSV files, plots and tables.md.")],
+) -> None:
+    """Poroelastic lung: pressure bounds, inverted elements, nu towards 0.5, contact methods, small hila."""
+    from vatsloc.study.stability_poro import stability_poro
+
+    stability_poro(out, say)
+    print(out / "tables.md")
 
 
 @bench.command("registration")

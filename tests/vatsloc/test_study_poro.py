@@ -10,6 +10,7 @@ from numpy.testing import assert_allclose
 
 from poro.tissue import Tissue
 from vatsloc.study import bench_poro as bench
+from vatsloc.study import stability_poro as stability
 from vatsloc.study.getfem_peer import getfem_python
 from vatsloc.study.poro_lung import HILUM_CENTRE, RADII_MM, in_smooth_wall, lung, system_of, wall_level
 
@@ -60,3 +61,16 @@ def test_sweep_covers_the_range_of_a_fit() -> None:
     width = np.array([3, 0.27, 12])
     assert_allclose(vectors.min(axis=0) / width, np.array([-10, 0.65, 0]) / width, atol=0.12)
     assert_allclose(vectors.max(axis=0) / width, np.array([-7, 0.92, 12]) / width, atol=0.12)
+
+
+def test_penalty_contact_nears_the_active_set_from_behind_the_wall() -> None:
+    """The stiffer the penalty, the less the penetration and the smaller the difference to Signorini's solution."""
+    exact, soft, stiffer = stability.contact_methods((1_500,))[:3]
+    assert exact["deepest_mm"] < 2e-3
+    assert soft["deepest_mm"] > 5 * stiffer["deepest_mm"] > 10 * exact["deepest_mm"]
+    assert stiffer["rel_diff"] < 0.2 * soft["rel_diff"] < 0.05
+
+
+def test_rows_become_a_markdown_table() -> None:
+    text = stability.markdown([{"kappa_b": 1e-8, "phi": 0.5}, {"kappa_b": 1e-7, "phi": 0.25}])
+    assert text.splitlines()[2:] == ["| 1e-08 | 0.5 |", "| 1e-07 | 0.25 |"]
