@@ -100,9 +100,8 @@ def pneumothorax(case: Case, prepared: Prepared, pose: ChangeOfPose, settings: S
     if settings.residual.on:
         with stages.stage("residual registration"):
             model = MeshMap(pose.mesh_inf, after, def_from_inf)
-            residual = residual_registration(
-                prepared.inflated, prepared.deflated, found.lung, model, before, settings.residual
-            )
+            images = prepared.inflated, prepared.deflated
+            residual = residual_registration(*images, found.lung, model, before, surface, settings.residual)
         after = after if residual is None else after + residual.displacement
     else:
         stages.skip("residual registration", "switched off in the settings")

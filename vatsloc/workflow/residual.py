@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy import ndimage
+from scipy.spatial import cKDTree
 
 from poro.extrapolate import extrapolate
 from poro.mesh import TetMesh
@@ -20,6 +21,7 @@ from registration.resample import resample, resample_mask
 from registration.volume import Array, Mask
 from vatsloc.imaging.cbct import PreparedCbct
 from vatsloc.imaging.lattice import dilate, erode
+from vatsloc.imaging.surface import Border, SurfacePoints
 from vatsloc.maps import MeshMap, covered, sampled
 from vatsloc.workflow.settings import ResidualSettings
 
@@ -27,6 +29,7 @@ PRIOR_SPACING_MM = 3.0
 BORDER_MM = 2.0
 NEAR_REGION_MM = 4.0
 LEAST_NODES = 30
+REACH_MM = 15.0
 
 
 @dataclass(frozen=True)
@@ -61,12 +64,13 @@ def residual_registration(
     lung_def: Mask,
     def_from_inf: MeshMap,
     mesh_before: TetMesh,
+    surface: SurfacePoints,
     settings: ResidualSettings,
 ) -> Residual | None:
     """Displacements that take the modelled nodes to where the images show their tissue; None where too little is seen.
 
     lung_def: the collapsed lung as it was segmented; def_from_inf: the model's map; mesh_before: its undeformed mesh in
-    the deflated CBCT's frame.
+    the deflated CBCT's frame; surface: observed points, which place the border where the images inside do not.
     """
     grid = deflated.volume.grid
     nodes = def_from_inf.moved
@@ -97,7 +101,33 @@ def residual_registration(
     wanted = (placed + other) / 2 - nodes
     chosen = np.flatnonzero(seen)
     field = extrapolate(mesh_before, chosen, wanted[chosen], Tissue()).u
+    border, offset = _border_offsets(TetMesh(nodes + field, modelled.tets), surface, ~seen)
+    if len(border):
+        imposed = np.concatenate([chosen, border])
+        motion = np.concatenate([wanted[chosen], field[border] + offset])
+        field = extrapolate(mesh_before, imposed, motion, Tissue()).u
     return Residual(field, compared, seen, disagreement, min(there.min_det, back.min_det))
+
+
+def _border_offsets(lung: TetMesh, surface: SurfacePoints, free: Array) -> tuple[Array, Array]:
+    """Free border nodes (k,) that face observed pleural air, and the moves (k, 3) mm that put them there.
+
+    Moves go along the nodes' normals.
+
+    An observed point counts for the node nearest to it, within REACH_MM, where both normals agree; a node takes their
+    mean.
+    """
+    border, air = lung.boundary, surface.only(Border.AIR)
+    if len(air) == 0:
+        return np.zeros(0, dtype=int), np.zeros((0, 3))
+    far, nearest = cKDTree(border.points).query(air.points)
+    normals = border.node_normals[nearest]
+    agree = (np.einsum("nd,nd->n", normals, air.normals) > 0.5) & (far < REACH_MM)
+    along = np.einsum("nd,nd->n", air.points - border.points[nearest], normals)[agree]
+    count = np.bincount(nearest[agree], minlength=len(border.nodes))
+    mean = np.bincount(nearest[agree], along, len(border.nodes)) / np.maximum(count, 1)
+    chosen = np.flatnonzero((count > 0) & free[border.nodes])
+    return border.nodes[chosen], mean[chosen, None] * border.node_normals[chosen]
 
 
 def _region(inside: Array, deflated: PreparedCbct) -> Mask:

@@ -65,7 +65,7 @@ class GateSettings(_Table):
     max_folded_share: float = 0.0
     max_inversion_mm: float = 1.0
     max_inverted_elements: float = 0.01
-    max_surface_mm: float = 4.0
+    max_surface_mm: float = 2.5
     min_surface_points: int = 200
     max_fissure_share: float = 0.1
     min_agreement: float = 0.5
