@@ -163,6 +163,38 @@ def test_a_lung_slides_past_a_wall_that_stays() -> None:
     assert error(plain.moving_from_fixed(near), near + slide).mean() > 2.0
 
 
+def test_bare_tissue_follows_the_depth_and_not_a_tapering_wall() -> None:
+    """Vessels deep in a cone move 9 mm along it; its wall and 9 mm of bare tissue below the wall look unmoved."""
+    vessels, slide = make_pattern(8), np.array([0.0, 0.0, 9.0])
+
+    def depth(points: Array) -> Array:
+        off = points - CENTRE
+        return 38.0 - 0.2 * off[:, 2] - np.hypot(off[:, 0], off[:, 1])
+
+    def scene(points: Array, shift: Array) -> Array:
+        d = depth(points)
+        tissue = -850 + 0.8 * (vessels(points + shift) + 500) * np.clip((d - 9) / 3, 0, 1)
+        return np.where(d > 0, tissue, 40.0)
+
+    def cone(g: Grid) -> Mask:
+        return Mask(depth(g.points().reshape(-1, 3)).reshape(g.shape) > 0, g.ras_from_ijk)
+
+    grid = oriented("LPS", (44, 44, 30), 2.5, CENTRE)
+    fixed = image_of(lambda p: scene(p, slide), grid)
+    moving = image_of(lambda p: scene(p, np.zeros(3)), WIDE)
+    fit = register_sliding(fixed, moving, cone(WIDE), COARSE, fixed_lung=cone(grid))
+    rng = np.random.default_rng(6)
+    bare = CENTRE + rng.uniform([-40, -40, -25], [40, 40, 10], (4000, 3))
+    bare = bare[(depth(bare) > 3) & (depth(bare) < 9)]
+    held = register_ffd(
+        masked(fixed, cone(grid)), masked(moving, cone(WIDE)), COARSE, fixed_mask=grown(cone(grid), 5.0)
+    )
+    along, before = (float(np.abs(f.moving_from_fixed(bare)[:, 2] - bare[:, 2] - slide[2]).mean()) for f in (fit, held))
+    assert along < 1.6
+    assert along < 0.7 * before
+    assert fit.folded_share == 0
+
+
 def test_masking_and_growing_by_value() -> None:
     grid = Grid((21, 21, 21), np.diag([1.0, 1.0, 2.0, 1.0]))
     inside = np.zeros(grid.shape, dtype=bool)
