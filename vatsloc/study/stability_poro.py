@@ -71,7 +71,7 @@ def inverted_elements() -> list[Row]:
 
 
 def towards_incompressible() -> list[Row]:
-    """Mean motion under weight alone as nu goes to 0.5 on two meshes: linear elements lock where the two part."""
+    """Mean motion under weight alone, without wall, as nu goes to 0.5, on two meshes."""
     rows = []
     for poisson in (0.35, 0.45, 0.49, 0.499, 0.4999):
         row: Row = {"poisson": poisson}
@@ -214,6 +214,6 @@ def markdown(rows: list[Row]) -> str:
     """Rows as a markdown table, numbers to three digits."""
     lines = ["| " + " | ".join(rows[0]) + " |", "|" + "---|" * len(rows[0])]
     for row in rows:
-        cells = (f"{v:.3g}" if isinstance(v, float) else str(v) for v in row.values())
+        cells = (f"{v:.4g}" if isinstance(v, float) else str(v) for v in row.values())
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines)
