@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import imaging_thorax as known
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
 from registration.volume import Volume
+from tests.vatsloc import imaging_thorax as known
 from vatsloc.errors import InputRefused
 from vatsloc.imaging.cbct import field_of_view, prepare_cbct
 from vatsloc.imaging.spine import segment_spine

@@ -5,12 +5,12 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import imaging_thorax as known
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
 from registration.volume import Mask, Volume
+from tests.vatsloc import imaging_thorax as known
 from vatsloc.case import read_case
 from vatsloc.errors import InputRefused
 from vatsloc.imaging.cbct import PreparedCbct, prepare_cbct
