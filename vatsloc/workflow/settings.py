@@ -35,10 +35,9 @@ class MeshSettings(_Table):
 
 
 class ModelSettings(_Table):
-    """Phase 2. cost: "plain" is the paper's; pose, hilum, diaphragm: the paper's variants leave one out."""
+    """Phase 2. cost: "plain" is the paper's; hilum, diaphragm: its variants leave one out."""
 
     cost: Literal["surface", "plain"] = "surface"
-    pose: bool = True
     hilum: bool = True
     diaphragm: bool = True
     hilum_radius_mm: float = Field(default=15.0, gt=0)
