@@ -95,6 +95,8 @@ def run_ours(folder: Path, rounds: int = ROUNDS) -> Ours:
         inflated[known],
         ct[known],
     )
+    if pose.ffd is None:
+        raise ValueError("the free-form deformation is switched off; switch it on to compare it")
     found = pose.ffd.moving_from_fixed
     row = score(images, found, found.dense(peer_grid(images))) | {
         "seconds": median(log.seconds[FREE_FORM] for log in logs[1:]),

@@ -119,9 +119,6 @@ def quality_gates(pose: ChangeOfPose, collapse: Collapse, limits: GateSettings) 
     air, fissure = (len(collapse.surface.only(border)) for border in (Border.AIR, Border.FISSURE))
     gates |= {
         "overlap": at_least(pose.overlap, limits.min_overlap, "The inflated CBCT shows too little of the lung."),
-        "registration_folds": at_most(
-            pose.ffd.folded_share, limits.max_folded_share, "The registration of phase 1 folds space."
-        ),
         "inverted_elements": at_most(inverted, limits.max_inverted_elements, "The collapse turns elements inside out."),
         "deflated_surface": at_least(air, limits.min_surface_points, "Too little of the collapsed lung is seen."),
         "fissures": at_most(
@@ -135,6 +132,11 @@ def quality_gates(pose: ChangeOfPose, collapse: Collapse, limits: GateSettings) 
             "The lung's surface stays off the observed one.",
         ),
     }
+    if pose.ffd is not None:
+        folded = pose.ffd.folded_share
+        gates["registration_folds"] = at_most(
+            folded, limits.max_folded_share, "The registration of phase 1 folds space."
+        )
     if collapse.residual is not None:
         gates["agreement"] = at_least(
             collapse.residual.agreed_share, limits.min_agreement, "Registrations there and back disagree."
@@ -168,7 +170,7 @@ def _note(pose: ChangeOfPose, collapse: Collapse, stages: Stages) -> None:
         stages.warn("Too little lung is seen in both CBCTs to correct the model by what they show inside it.")
     if not collapse.found.is_collapsed:
         stages.warn("The deflated CBCT shows hardly any pleural air, so the lung may not have collapsed.")
-    if pose.seen.all():
+    if pose.ffd is not None and pose.seen.all():
         stages.skip("extrapolation", "the inflated CBCT shows the whole lung")
     unsettled = collapse.fit.status
     if unsettled is not FitStatus.CONVERGED:

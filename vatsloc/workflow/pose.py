@@ -33,18 +33,18 @@ RIM_MM = 4.0
 class ChangeOfPose:
     """The lung before its collapse. mesh_ct, points_inf: the same nodes in the CT and in the inflated CBCT, mm.
 
-    inversion: of the free-form deformation at the nodes; seen: (n,) nodes that the scanner saw; lung_inf: lung mask in
-    the CBCT; overlap: share of the lung in its field of view.
+    ffd, its inversion at the nodes and extrapolation: None where the lung was left to the spine alone; seen: (n,) nodes
+    that the scanner saw; lung_inf: lung mask in the CBCT; overlap: share of the lung in its field of view.
     """
 
     rigid: RigidFit
-    ffd: FfdFit
+    ffd: FfdFit | None
     lung_inf: Mask
     mesh_ct: TetMesh
     points_inf: Array
     seen: Array
-    inversion: Inversion
-    extrapolation: Extrapolation
+    inversion: Inversion | None
+    extrapolation: Extrapolation | None
     overlap: float
 
     @property
@@ -80,6 +80,13 @@ def change_of_pose(case: Case, prepared: Prepared, settings: Settings, stages: S
     with stages.stage("inflated lung"):
         prior = carry_prior(prepared.lungs, as_side(case.side), prepared.inflated.volume, ct_from_inf_rigid)
         lung_inf = inflated_lung(prepared.inflated, prior)
+    with stages.stage("mesh"):
+        mesh = stuff(prepared.lung_ct.inside, prepared.lung_ct.ras_from_ijk, settings.mesh.edge_mm)
+    placed = TetMesh(inf_from_ct_rigid(mesh.points), mesh.tets)
+    if not settings.registration.on:
+        stages.skip("free-form deformation", "switched off in the settings")
+        nowhere = np.zeros(len(mesh.points), dtype=bool)
+        return ChangeOfPose(rigid, None, lung_inf, mesh, placed.points, nowhere, None, None, overlap)
     with stages.stage("free-form deformation"):
         ffd = register_sliding(
             prepared.inflated.volume,
@@ -91,22 +98,18 @@ def change_of_pose(case: Case, prepared: Prepared, settings: Settings, stages: S
             prior=ct_from_inf_rigid,
             progress=lambda what, _share: stages.say(what),
         )
-    with stages.stage("mesh"):
-        mesh = stuff(prepared.lung_ct.inside, prepared.lung_ct.ras_from_ijk, settings.mesh.edge_mm)
     with stages.stage("inversion and extrapolation"):
-        placed = inf_from_ct_rigid(mesh.points)
-        inversion = invert_at(ffd.moving_from_fixed, mesh.points, placed)
+        inversion = invert_at(ffd.moving_from_fixed, mesh.points, placed.points)
         seen = _deep_inside(prepared.inflated.field.usable, inversion.points_fixed)
         seen &= inversion.residual_mm < settings.gates.max_inversion_mm
         nodes = np.flatnonzero(seen)
-        rigid_mesh = TetMesh(placed, mesh.tets)
-        extension = extrapolate(rigid_mesh, nodes, (inversion.points_fixed - placed)[nodes], Tissue())
+        extension = extrapolate(placed, nodes, (inversion.points_fixed - placed.points)[nodes], Tissue())
     return ChangeOfPose(
         rigid=rigid,
         ffd=ffd,
         lung_inf=lung_inf,
         mesh_ct=mesh,
-        points_inf=placed + extension.u,
+        points_inf=placed.points + extension.u,
         seen=seen,
         inversion=inversion,
         extrapolation=extension,

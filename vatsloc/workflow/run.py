@@ -25,6 +25,7 @@ from vatsloc.report.render import write_report
 from vatsloc.results import OUTPUT_FILES, REPORT, ResultData, RunRecord, write_results
 from vatsloc.workflow.localize import Localization, localize, surface_distances
 from vatsloc.workflow.pneumothorax import contact_surface
+from vatsloc.workflow.pose import ChangeOfPose
 from vatsloc.workflow.residual import Residual
 from vatsloc.workflow.settings import Settings
 from vatsloc.workflow.stages import Say, Stages, quiet
@@ -88,7 +89,7 @@ def _result(case: Case, found: Localization, fields: _Fields, run: RunRecord) ->
     pressure, contact = collapse.on_lung(np.column_stack([state.p, state.contact_pressure])).T
     none = np.zeros(len(pressure))
     outer, cage = after.boundary, contact_surface(collapse)
-    pose_det = pose.extrapolation.det_f
+    pose_det = pose.mesh_inf.volumes / pose.mesh_ct.volumes
     return ResultData(
         nodule_inflated_ras=found.nodule_inf,
         nodule_deflated_ras=found.nodule_def,
@@ -184,28 +185,9 @@ def _residuals(found: Localization) -> dict[str, Any]:
     pose, collapse = found.pose, found.collapse
     state = collapse.fit.state
     return {
-        "spine_ct_inflated": {
-            "ncc": pose.rigid.ncc,
-            "runner_up": pose.rigid.runner_up_ncc,
-            "status": pose.rigid.status.value,
-        },
-        "spine_inflated_deflated": {
-            "ncc": collapse.rigid.ncc,
-            "runner_up": collapse.rigid.runner_up_ncc,
-            "status": collapse.rigid.status.value,
-        },
-        "free_form": {
-            "status": pose.ffd.status.value,
-            "min_det": pose.ffd.min_det,
-            "folded_share": pose.ffd.folded_share,
-        },
-        "inversion_mm": {"max_at_seen_nodes": pose.inversion.residual_mm[pose.seen].max(initial=0.0)},
-        "extrapolation": {
-            "status": pose.extrapolation.status.value,
-            "imposed_nodes": int(pose.seen.sum()),
-            "released_nodes": len(pose.extrapolation.released),
-            "min_det": pose.extrapolation.det_f.min(),
-        },
+        "spine_ct_inflated": _spine(pose.rigid),
+        "spine_inflated_deflated": _spine(collapse.rigid),
+        **_change_of_pose(pose),
         "hilum": {"source": collapse.motion.source.value, "mean_mm": collapse.motion.displacement.mean(axis=0)},
         "fit": {
             "status": collapse.fit.status.value,
@@ -222,6 +204,29 @@ def _residuals(found: Localization) -> dict[str, Any]:
     }
 
 
+def _spine(fit: RigidFit) -> dict[str, Any]:
+    return {"ncc": fit.ncc, "runner_up": fit.runner_up_ncc, "overlap": fit.overlap, "status": fit.status.value}
+
+
+def _change_of_pose(pose: ChangeOfPose) -> dict[str, Any]:
+    if pose.ffd is None or pose.inversion is None or pose.extrapolation is None:
+        return {"free_form": None, "extrapolation": None}
+    return {
+        "free_form": {
+            "status": pose.ffd.status.value,
+            "min_det": pose.ffd.min_det,
+            "folded_share": pose.ffd.folded_share,
+        },
+        "inversion_mm": {"max_at_seen_nodes": pose.inversion.residual_mm[pose.seen].max(initial=0.0)},
+        "extrapolation": {
+            "status": pose.extrapolation.status.value,
+            "imposed_nodes": int(pose.seen.sum()),
+            "released_nodes": len(pose.extrapolation.released),
+            "min_det": pose.extrapolation.det_f.min(),
+        },
+    }
+
+
 def _corrected(residual: Residual | None) -> dict[str, Any] | None:
     if residual is None:
         return None
@@ -232,10 +237,6 @@ def _corrected(residual: Residual | None) -> dict[str, Any] | None:
         "median_disagreement_mm": float(np.median(residual.disagreement_mm[residual.seen])),
         "min_det": residual.min_det,
     }
-
-
-def _spine(fit: RigidFit) -> dict[str, Any]:
-    return {"ncc": fit.ncc, "runner_up": fit.runner_up_ncc, "overlap": fit.overlap, "status": fit.status.value}
 
 
 def _pictures(case: Case, found: Localization) -> tuple[Picture, ...]:

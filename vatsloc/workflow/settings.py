@@ -16,8 +16,11 @@ class _Table(BaseModel):
 
 
 class RegistrationSettings(_Table):
-    """Free-form deformation of phase 1. Lengths in mm; bending: weight of the bending energy, mm2."""
+    """Free-form deformation of phase 1. Lengths in mm; bending: weight of the bending energy, mm2; on: off leaves the
+    lung to the spine, the paper's variant without change of pose.
+    """
 
+    on: bool = True
     grid_mm: float = Field(default=16.0, ge=4, le=64)
     levels: int = Field(default=4, ge=1, le=6)
     voxel_mm: float = Field(default=2.0, ge=0.5, le=8)
