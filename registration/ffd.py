@@ -157,7 +157,7 @@ def _level(setting: _Setting, images: Images, spline: BSplineField) -> tuple[BSp
     weights, control, prior = setting.settings.weights, spline.control, setting.prior
     image = ImageTerm(
         images.samples,
-        _metric(images, setting.settings),
+        chosen_metric(images, setting.settings),
         images.moving,
         prior,
         control,
@@ -175,7 +175,8 @@ def _level(setting: _Setting, images: Images, spline: BSplineField) -> tuple[BSp
     return BSplineField(np.moveaxis(descent.coefficients, 0, 3).astype(float), spline.ras_from_ijk), descent
 
 
-def _metric(images: Images, settings: FfdSettings) -> Metric:
+def chosen_metric(images: Images, settings: FfdSettings) -> Metric:
+    """The correlation that the settings ask for, on the samples of one level."""
     if settings.window_mm is None:
         return GlobalNcc(images.fixed)
     grid = images.samples.grid

@@ -1,4 +1,4 @@
-"""Registration of a lung that slides along its wall: its depth first, then all of it masked from what lies around.
+"""Registration of a lung that slides along its wall: whole or depth alone first, then masked from what lies around.
 
 Ref: Wu 2008; Alvarez 2021, section 6.1.4 (the masked images); the order is our own.
 """
@@ -11,13 +11,16 @@ from dataclasses import replace
 import numpy as np
 from scipy import ndimage
 
-from registration.ffd import FfdFit, FfdSettings, register_ffd
+from registration.ffd import FfdFit, FfdSettings, chosen_metric, register_ffd
 from registration.field import PointMap
+from registration.interpolate import interpolate
+from registration.pyramid import Images, Pyramid
 from registration.resample import coarsen, coarsen_mask, resample_mask
 from registration.volume import Array, Mask, Volume
 
 OUTSIDE_HU = -1100.0
 BEYOND_MM = 5.0
+LAST_LEVELS = 2
 DEEP_MM = 8.0
 """Nearer to the wall than this a lung shows hardly any vessel, but the wall itself, which slides."""
 
@@ -36,21 +39,22 @@ def register_sliding(
     """Free-form deformation of a lung alone, whatever its wall does.
 
     fixed_lung: the lung in the fixed image; without it, a first registration with the metric inside the moving lung
-    (placed by `prior`) carries the moving lung over. seen: field of view of the fixed image. The vessels deeper than
-    8 mm are registered first: a smooth wall looks alike wherever it has slid to, so it would hold the coarse levels at
-    the prior. Then both images are set to -1100 HU outside their lungs and compared inside the fixed lung grown by 5 mm
-    at the finest level, so the wall is met and nothing outside can pull.
+    (placed by `prior`) carries the moving lung over. seen: field of view of the fixed image. A smooth wall looks alike
+    wherever it has slid to, so it can hold the coarse levels at the prior; without it the depth can run away. Hence two
+    first registrations, of the whole lung and of what lies deeper than 8 mm, and the one under which the depth looks
+    more alike is kept. Then both images are set to -1100 HU outside their lungs and compared inside the fixed lung
+    grown by 5 mm at the two finest levels, so the wall is met and nothing outside can pull.
     """
     if fixed_lung is None:
         fixed_lung = _carried(fixed, moving, moving_lung, settings, seen, prior)
-    prior = _deep(fixed, moving, fixed_lung, settings, seen, prior, progress)
+    prior = _first(fixed, moving, fixed_lung, settings, seen, prior, progress)
     region = grown(fixed_lung, BEYOND_MM)
     if seen is not None:
         region = Mask(region.inside & seen.inside, region.ras_from_ijk)
     return register_ffd(
         masked(fixed, fixed_lung),
         masked(moving, moving_lung),
-        replace(settings, levels=1),
+        replace(settings, levels=min(settings.levels, LAST_LEVELS)),
         fixed_mask=region,
         prior=prior,
         progress=progress,
@@ -75,7 +79,7 @@ def grown(mask: Mask, distance_mm: float) -> Mask:
     return Mask(inside, mask.ras_from_ijk)
 
 
-def _deep(
+def _first(
     fixed: Volume,
     moving: Volume,
     lung: Mask,
@@ -84,18 +88,30 @@ def _deep(
     prior: PointMap | None,
     progress: Callable[[str, float], None] | None,
 ) -> PointMap | None:
-    """Map found by what lies deeper than DEEP_MM, continued by stiff bending; the prior where nothing lies so deep."""
-    stiff = replace(settings.weights, bending=3 * settings.weights.bending)
-    settings = replace(settings, levels=max(settings.levels - 1, 1), voxel_mm=1.5 * settings.voxel_mm, weights=stiff)
-    fixed = coarsen(fixed, settings.voxel_mm)
+    """Map found on coarser voxels by the whole lung or by its depth, whichever makes the depth look more alike; the
+    prior where nothing lies so deep."""
+    settings = replace(settings, voxel_mm=1.5 * settings.voxel_mm)
+    fixed, moving = coarsen(fixed, settings.voxel_mm), coarsen(moving, settings.voxel_mm)
     inside = coarsen_mask(lung, settings.voxel_mm).hu >= 0.5
     shown = np.ones_like(inside) if seen is None else coarsen_mask(seen, settings.voxel_mm).hu >= 0.5
     # Where the scanner's view ends there is no wall, so the depth counts from what it shows outside the lung.
     depth = ndimage.distance_transform_edt(inside | ~shown, sampling=fixed.grid.spacing)
-    deep = Mask(inside & shown & (depth > DEEP_MM), fixed.ras_from_ijk)
+    whole, deep = (Mask(inside & shown & (depth > least), fixed.ras_from_ijk) for least in (0.0, DEEP_MM))
     if not deep.inside.any():
         return prior
-    return register_ffd(fixed, moving, settings, fixed_mask=deep, prior=prior, progress=progress).moving_from_fixed
+    samples = Pyramid(fixed, deep, moving, None).at(settings.voxel_mm)
+    found = [
+        register_ffd(fixed, moving, settings, fixed_mask=region, prior=prior, progress=progress).moving_from_fixed
+        for region in (whole, deep)
+    ]
+    return min(found, key=lambda candidate: _unlikeness(samples, candidate, settings))
+
+
+def _unlikeness(images: Images, found: PointMap, settings: FfdSettings) -> float:
+    """Dissimilarity of the samples under a map."""
+    m = interpolate(images.moving.hu, images.moving.grid, found(images.samples.points()), OUTSIDE_HU)
+    weights = np.ones(len(m), dtype=np.float32)
+    return chosen_metric(images, settings).evaluate(m, weights, with_slope=False).value
 
 
 def _carried(
