@@ -140,18 +140,33 @@ def stability_poro_command(
     print(out / "tables.md")
 
 
+@stability.command("registration")
+def stability_registration_command(
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for CSV files, the plot and tables.md.")],
+) -> None:
+    """Registration: noise, view, start, motion, collapsed lung, and the spine's pose; goes on where it was stopped."""
+    from vatsloc.study.stability_registration import stability_registration
+
+    stability_registration(out, say)
+    print(out / "tables.md")
+
+
 @bench.command("registration")
 def bench_registration_command(
     cases: Annotated[
-        list[Path] | None, typer.Argument(metavar="CASES", help="Case folders; default: phantoms.")
+        list[Path] | None,
+        typer.Argument(metavar="CASES", help="Case folders, or NAME:SEED of a phantom; default: three phantoms."),
     ] = None,
+    out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="Markdown page to write.")] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Phase 1: errors at the landmarks, seconds, memory and folding beside itk-elastix, and cost against image size."""
-    from vatsloc.study.bench_registration import bench_registration, table
+    from vatsloc.study.bench_registration import bench_registration, page, table
 
     result = bench_registration(cases or [], say=say)
     say(table(result))
+    if out is not None:
+        out.write_text(page(result), encoding="utf-8")
     if as_json:
         show(result)
 

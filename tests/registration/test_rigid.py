@@ -84,6 +84,18 @@ def test_a_start_nearby_replaces_the_search() -> None:
     assert_allclose(fit.moving_from_fixed(CENTRE[None]), move(CENTRE[None]), atol=0.8)
 
 
+def test_a_hint_overrides_the_search() -> None:
+    """A start one vertebra off, with less than half a vertebra to search, stays there, and the better pose is told."""
+    move = RigidTransform.about(CENTRE, np.radians([0.0, 5.0, 8.0]), np.array([4.0, 2.0, 10.0]))
+    slipped = RigidTransform.about(CENTRE, np.zeros(3), np.array([0.0, 0.0, PITCH])) @ move
+    held = SpineSearch(shift_mm=10.0, surroundings_mm=30.0)
+    grid = fixed_grid(move)
+    fit = register_spine(scene(grid, move), scene(MOVING), column(grid, move), initial=slipped, search=held)
+    assert_allclose(fit.moving_from_fixed(CENTRE[None]), slipped(CENTRE[None]), atol=4.0)
+    assert fit.runner_up_ncc > fit.ncc
+    assert fit.status is RigidStatus.AMBIGUOUS
+
+
 def test_nothing_in_common_is_called_poor() -> None:
     still = RigidTransform.identity()
     noise = Volume(np.random.default_rng(0).normal(0, 200, MOVING.shape).astype(np.float32), MOVING.ras_from_ijk)

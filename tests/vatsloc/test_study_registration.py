@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
 from registration.field import DisplacementField
+from registration.interpolate import interpolate
 from registration.rigid import RigidTransform
 from registration.volume import Mask, Volume
 from vatsloc.study import bench_registration as bench
-from vatsloc.study.bench_registration import Ours, bench_registration, score, table
+from vatsloc.study import stability_registration as stability
+from vatsloc.study.bench_registration import Ours, bench_registration, case_folder, page, score, table
 from vatsloc.study.cost_registration import Images, exponent
 from vatsloc.study.elastix import ElastixSettings, elastix_version, run_elastix
 from vatsloc.study.isolated import isolated
+from vatsloc.study.stability_registration import Scene, make_pair
+from vatsloc.workflow.stages import quiet
 
 AGREED = {"tre_mean", "tre_p95", "tre_max", "seconds", "peak_mb", "min_det", "folded_share"}
 AFFINE = np.diag([-2.0, -2.0, 2.0, 1.0])
@@ -79,6 +84,51 @@ def test_without_elastix_its_row_is_null(images: Images, monkeypatch: pytest.Mon
     assert case["rigid"]["tre_mean"] == pytest.approx(np.sqrt(27))
     assert result["cost"] == cost
     assert "itk-elastix is not installed" in table(result)
+
+
+def test_the_page_counts_where_we_are_no_worse() -> None:
+    ours = {"tre_mean": 0.5, "tre_p95": 2.0, "tre_max": 3.0, "seconds": 4.0, "peak_mb": 1, "min_det": 1}
+    ours |= {"folded_share": 0.0, "seconds_phase1": 1.0, "seconds_cold": 1.0, "seconds_spine": 1.0}
+    peer = ours | {"tre_mean": 0.7, "tre_p95": 1.5, "seconds": 26.0}
+    case = {"name": "one", "ours": ours, "rigid": ours, "elastix": peer, "elastix_rows": {"lung mask": peer}}
+    cost = {"sizes": [], "exponent_seconds": 1.0, "exponent_mb": 1.0}
+    made = page({"cases": [case], "cost": cost, "elastix_version": "1"})
+    assert made.endswith("| one | 6.5 x | yes | no | yes |\n")
+
+
+def test_a_name_and_a_seed_make_a_phantom(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    made: list[Any] = []
+    monkeypatch.setattr(bench, "write_phantom", lambda *given: made.append(given[:3]))
+    assert case_folder(Path("small-left:12"), tmp_path, quiet) == tmp_path / "small-left-12"
+    assert made == [("small-left", tmp_path / "small-left-12", 12)]
+    assert case_folder(Path("some/folder"), tmp_path, quiet) == Path("some/folder")
+    assert len(made) == 1
+
+
+def test_the_study_s_scene_moves_as_its_truth_says() -> None:
+    pair = make_pair(Scene(noise_hu=0.0), 0)
+    there = interpolate(pair.moving.hu, pair.moving.grid, pair.truth, 0.0)
+    here = interpolate(pair.fixed.hu, pair.fixed.grid, pair.probes, 0.0)
+    assert np.corrcoef(here, there)[0, 1] > 0.95
+    still = interpolate(pair.moving.hu, pair.moving.grid, pair.probes, 0.0)
+    assert np.corrcoef(here, still)[0, 1] < 0.5
+
+
+def test_a_finished_sweep_is_read_and_not_run_again(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    ran: list[str] = []
+
+    def row(axis: str, _values: Any) -> list[dict[str, Any]]:
+        ran.append(axis)
+        names = ("plain", "masked", "ours")
+        return [{axis: 1.0, "method": m, "start_mm": 2.0, "tre_mean": 0.5, "success": 1.0} for m in names]
+
+    monkeypatch.setattr(stability, "sweep", row)
+    monkeypatch.setattr(stability, "spine_sweep", lambda: [{"spine": "whole", "right": 2}])
+    first = stability.stability_registration(tmp_path, quiet)
+    assert stability.stability_registration(tmp_path, quiet) == first
+    assert ran == list(stability.AXES)
+    assert "| 1 | masked | 2 | 0.5 | 1 |" in (tmp_path / "tables.md").read_text()
+    assert (tmp_path / "stability-registration.png").stat().st_size > 1000
 
 
 @pytest.mark.skipif(elastix_version() is None, reason="itk-elastix is not installed")

@@ -18,12 +18,13 @@ THREADS = 2
 
 @dataclass(frozen=True)
 class ElastixSettings:
-    """What `run_elastix` asks of elastix: B-spline grid in mm, levels, iterations per level, samples per iteration."""
+    """What `run_elastix` asks of elastix: finest B-spline grid in mm, which doubles per coarser level; levels;
+    iterations per level; samples per iteration."""
 
     grid_mm: float = 16.0
     levels: int = 5
     iterations: int = 500
-    samples: int = 4000
+    samples: int = 10_000
 
 
 @dataclass(frozen=True)
@@ -53,6 +54,10 @@ def run_elastix(fixed: Volume, moving: Volume, fixed_mask: Mask, settings: Elast
     chosen["Metric"] = ["AdvancedNormalizedCorrelation"]
     chosen["MaximumNumberOfIterations"] = [str(settings.iterations)]
     chosen["NumberOfSpatialSamples"] = [str(settings.samples)]
+    # Its own schedule grows by 1.41 per level: 64 mm at the coarsest, from which whole lungs are caught less often.
+    chosen["GridSpacingSchedule"] = [str(2**level) for level in reversed(range(settings.levels))]
+    for pyramid in ("FixedImagePyramid", "MovingImagePyramid"):
+        chosen[pyramid] = [pyramid.replace("Image", "RecursiveImage")]  # coarse levels are sampled coarsely too
     chosen["ErodeMask"] = ["false"]  # eroded masks leave next to nothing at the coarse levels
     chosen["WriteResultImage"] = ["false"]
     parameters.AddParameterMap(chosen)

@@ -15,7 +15,7 @@ from registration.inversion import Inversion, invert_at
 from registration.resample import coarsen_mask
 from registration.rigid import RigidTransform
 from registration.sliding import register_sliding
-from registration.spine import RigidFit, register_spine
+from registration.spine import RigidFit, SpineSearch, register_spine
 from registration.volume import Array, Mask
 from vatsloc.case import Case
 from vatsloc.imaging.lungs import Side
@@ -27,6 +27,8 @@ from vatsloc.workflow.stages import Stages
 
 RIM_MM = 4.0
 """Nodes nearer than this to the rim of what the scanner saw are left to the extrapolation."""
+HINT_REACH_MM = 10.0
+"""How far a marked vertebra may be off: less than half the distance to the next one."""
 
 
 @dataclass(frozen=True)
@@ -65,14 +67,16 @@ class ChangeOfPose:
 
 def change_of_pose(case: Case, prepared: Prepared, settings: Settings, stages: Stages) -> ChangeOfPose:
     """Register the CT to the inflated CBCT and continue the motion to the whole lung."""
+    hinted = _hinted(case)
     with stages.stage("spine CT to inflated"):
         rigid = register_spine(
             prepared.inflated.volume,
             case.ct,
             prepared.spine_inflated.mask,
             prepared.spine_ct.mask,
-            initial=_hinted(case),
+            initial=hinted,
             fixed_seen=prepared.inflated.field.usable,
+            search=None if hinted is None else SpineSearch(shift_mm=HINT_REACH_MM),
         )
     ct_from_inf_rigid, inf_from_ct_rigid = rigid.moving_from_fixed, rigid.moving_from_fixed.inverse()
     overlap = visible_share(prepared.lung_ct, prepared.inflated.field, inf_from_ct_rigid)
