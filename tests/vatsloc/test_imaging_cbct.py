@@ -64,6 +64,10 @@ def test_lost_contrast_is_given_back() -> None:
     squeezed = Volume((40 + 0.8 * (truth.hu - 40)).astype(np.float32), truth.ras_from_ijk)
     done = prepare_cbct(known.cone_beam(squeezed, (30.0, -20.0), 100.0, (-50.0, 0.0)))
     assert_allclose(done.removed.gain, 0.8, atol=0.03)
+    seen = done.field.usable.inside & known.thorax().lungs["right"].inside
+    raw = known.cone_beam(squeezed, (30.0, -20.0), 100.0, (-50.0, 0.0)).hu[seen]
+    assert_allclose(done.removed.before["lung"], np.median(raw), atol=30.0)
+    assert_allclose(done.removed.after["lung"], -850.0, atol=30.0)
     lung = known.thorax().lungs["right"].inside & done.field.usable.inside
     assert_allclose(np.median(done.volume.hu[lung]), -850.0, atol=30.0)
 
