@@ -26,8 +26,8 @@ from vatsloc.workflow.prepare import prepare
 from vatsloc.workflow.settings import Settings
 from vatsloc.workflow.stages import Say, Stages, quiet
 
-PHANTOMS = (Path("small-right:1"), Path("right:1"), Path("high-diaphragm:4"))
-"""Name and seed of the phantoms that are made when no case is given; the registration was not chosen on them."""
+PHANTOMS = (Path("small-right:11"), Path("left:12"), Path("high-diaphragm:13"))
+"""Name and seed of the phantoms that are made when no case is given; nothing was chosen on these seeds."""
 
 ROUNDS = 2
 PEER_VOXEL_MM = 1.5
