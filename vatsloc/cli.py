@@ -171,6 +171,23 @@ def bench_registration_command(
         show(result)
 
 
+@bench.command("real")
+def bench_real_command(
+    people: Annotated[
+        list[Path],
+        typer.Argument(metavar="DIR...", help="Folders with lung masks at two breath-holds and landmark pairs."),
+    ],
+    as_json: JsonOption = False,
+) -> None:
+    """Real lungs: move one breath-hold into the other by shape alone; errors at landmarks that were only scored."""
+    from vatsloc.study.bench_real import bench_real, table
+
+    result = bench_real(people, say=say)
+    say(table(result))
+    if as_json:
+        show(result)
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line; errors a user can act on become one sentence and an exit code."""
     try:

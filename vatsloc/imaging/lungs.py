@@ -73,6 +73,28 @@ def segment_lungs(ct: Volume, side: Side, nodule: Mask | None = None, nodule_ras
     return Lungs(masks["left"], masks["right"], on_grid(airways, work.grid, ct.grid), midline, volume)
 
 
+def split_lungs(both: Mask) -> dict[Side, Mask]:
+    """Left and right lung of one mask of both, on voxels about 2 mm wide along the patient's axes, dents closed.
+
+    Raises InputRefused when one of the lungs is missing.
+    """
+    work = working_copy(Volume(both.inside.astype(np.float32), both.ras_from_ijk), SPACING_MM)
+    spacing, voxel_ml = work.grid.spacing, float(work.grid.spacing.prod()) / 1000
+    pieces = _lung_pieces(work.hu >= 0.5, voxel_ml)
+    empty = np.zeros(work.grid.shape, dtype=bool)
+    halves = _sides(work.grid, pieces, _midline(work.grid, pieces, empty)) if pieces else {}
+    lungs: dict[Side, Mask] = {}
+    for side in ("left", "right"):
+        volume = float(halves[side].sum()) * voxel_ml if halves else 0.0
+        if volume < LEAST_LUNG_ML:
+            raise InputRefused(
+                f"The mask holds {volume:.0f} ml of the {side} lung, {LEAST_LUNG_ML:.0f} ml needed; "
+                "give one mask of both lungs."
+            )
+        lungs[side] = Mask(_finished(halves[side], halves[_other(side)], None, spacing), work.ras_from_ijk)
+    return lungs
+
+
 def _other(side: str) -> str:
     return "right" if side == "left" else "left"
 

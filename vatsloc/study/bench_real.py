@@ -1,0 +1,91 @@
+"""Benchmark on real lungs: one breath-hold's lungs moved into the other's by shape alone, scored at landmarks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from poro.mesh.tetmesh import Array
+from vatsloc.evaluation.statistics import distances, summarize
+from vatsloc.study.affine import affine_to_points, affine_to_shape
+from vatsloc.study.breaths import Motion, Person, read_person
+
+EDGE_MM = 10.0
+UNMOVED, CENTROID, SHAPE_AFFINE = "unmoved", "centroid of the shape", "affine map fitted to the shape"
+TRUE_AFFINE = "affine map fitted to the landmarks"
+"""The last row has seen the truth: it is what a map of twelve numbers per lung can reach at best."""
+
+Predict = Callable[[Motion], Array]
+
+
+def by_centroid(motion: Motion) -> Array:
+    """Landmarks shifted as the lung's centroid is."""
+    shift = _centroid(motion.onto.points, motion.onto.node_areas) - _centroid(
+        motion.mesh.boundary.points, motion.mesh.boundary.node_areas
+    )
+    return motion.landmarks + shift
+
+
+def by_shape_affine(motion: Motion) -> Array:
+    """Landmarks moved by the affine map that lays surface on surface."""
+    return affine_to_shape(motion.mesh.boundary, motion.onto)(motion.landmarks)
+
+
+def by_true_affine(motion: Motion) -> Array:
+    """Landmarks moved by the affine map fitted to them."""
+    return affine_to_points(motion.landmarks, motion.truth)(motion.landmarks)
+
+
+ROWS: dict[str, Predict] = {
+    UNMOVED: lambda motion: motion.landmarks,
+    CENTROID: by_centroid,
+    SHAPE_AFFINE: by_shape_affine,
+    TRUE_AFFINE: by_true_affine,
+}
+
+
+def bench_real(folders: Sequence[Path], say: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
+    """Errors at the landmarks of every person, from inspiration to expiration and back, per lung and pooled.
+
+    Raises as `read_person`, before anything is computed.
+    """
+    people = [read_person(folder) for folder in folders]
+    return {"cases": [measure(person, deflate, say) for person in people for deflate in (True, False)]}
+
+
+def measure(person: Person, deflate: bool, say: Callable[[str], None]) -> dict[str, Any]:
+    """All rows of one person and one direction."""
+    direction = "inspiration to expiration" if deflate else "expiration to inspiration"
+    say(f"{person.name}: {direction} ...")
+    motions = person.motions(deflate, EDGE_MM)
+    rows: dict[str, Any] = {}
+    for name, predict in ROWS.items():
+        errors = {str(motion.side): distances(predict(motion), motion.truth) for motion in motions}
+        errors["both"] = np.concatenate(list(errors.values()))
+        rows[name] = {lung: _statistics(e) for lung, e in errors.items()}
+    return {"name": person.name, "direction": direction, "rows": rows}
+
+
+def table(result: dict[str, Any]) -> str:
+    """The benchmark as text: mean / 95 % / maximum in mm."""
+    lines = []
+    for case in result["cases"]:
+        lines.append(f"{case['name']}, {case['direction']}: mean / 95 % / maximum in mm at the landmarks")
+        lungs = list(next(iter(case["rows"].values())))
+        lines.append(" " * 40 + "".join(f"{lung:>22s}" for lung in lungs))
+        for name, row in case["rows"].items():
+            cells = (f"{s['mean']:.2f} / {s['p95']:.1f} / {s['max']:.1f}" for s in row.values())
+            lines.append(f"  {name:38s}" + "".join(f"{cell:>22s}" for cell in cells))
+    return "\n".join(lines)
+
+
+def _statistics(errors_mm: Array) -> dict[str, float | int]:
+    s = summarize(errors_mm)
+    return {"mean": s.mean, "p95": s.p95, "max": s.max, "n": s.n}
+
+
+def _centroid(points: Array, areas: Array) -> Array:
+    return np.average(points, axis=0, weights=areas)
