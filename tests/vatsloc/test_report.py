@@ -14,9 +14,7 @@ from numpy.testing import assert_allclose
 
 from registration.rigid import RigidTransform
 from registration.volume import Mask, Volume
-from vatsloc.formats.meshes import Surface
 from vatsloc.report.charts import LABEL, bars, box_plot
-from vatsloc.report.collect import depth_below
 from vatsloc.report.data import LUNG, NODULE, Comparison, Nodule, Outline, Picture, ReportData, TreSection
 from vatsloc.report.paint import bgr
 from vatsloc.report.render import MEASURE_NAMES, judge, render, with_scores
@@ -80,8 +78,8 @@ def page():
 
 
 def viewer(page):
-    text = re.search(r'<script type="application/json" id="stacks">(.*?)</script>', page, re.DOTALL)[1]
-    return {stack["name"]: stack for stack in json.loads(text)}
+    text = re.search(r'<script type="application/json" id="scene">(.*?)</script>', page, re.DOTALL)[1]
+    return {stack["name"]: stack for stack in json.loads(text)["stacks"]}
 
 
 def pixels(uri):
@@ -134,7 +132,7 @@ def test_page_is_well_formed_and_every_picture_is_described(page):
     assert parser.open == []
     assert len(parser.ids) == len(set(parser.ids))
     images = re.findall(r"<img [^>]*>", page)
-    assert len(images) == 3 * 3 + 2 * 3 + 3
+    assert len(images) == 3 * 2 + 2 * 3 + 3
     assert all(re.search(r'alt="[^"]{10,}"', tag) for tag in images)
     sliders = re.findall(r'<input type="range"[^>]*>', page)
     assert len(sliders) == 4
@@ -179,17 +177,6 @@ def test_words_of_the_run_cannot_become_markup():
     page = words_alone(warnings=["a </script><b>bold</b> claim"])
     assert "<b>bold" not in page
     assert "a &lt;/script&gt;&lt;b&gt;bold" in page
-
-
-@pytest.mark.parametrize("name", ["axial", "coronal", "sagittal"])
-def test_outline_layer_marks_the_nodule_where_it_is(page, name):
-    stack = viewer(page)[name]
-    layer = pixels(stack["lines"][stack["start"]])
-    column, row = pixel_of(stack, CENTRE)
-    at = layer[round(2 * row + 0.5), round(2 * column + 0.5)]
-    assert_allclose(at, [*bgr(NODULE), 255], atol=8)
-    elsewhere = pixels(stack["lines"][0])[round(2 * row + 0.5), round(2 * column + 0.5)]
-    assert elsewhere[3] == 0
 
 
 @pytest.mark.parametrize("name", ["axial", "coronal", "sagittal"])
@@ -268,13 +255,3 @@ def test_box_spans_the_quartiles():
     assert ticks[0.0] == LABEL
     assert_allclose([float(x), float(x) + float(width)], [ticks[1.0], ticks[3.0]], atol=0.1)
     assert plot.count("<circle") == 5
-
-
-def test_depth_below_a_surface_is_signed_and_names_the_nearest_point():
-    # A triangle in the plane x = 10 that looks along +x: the lung is on its -x side.
-    surface = Surface(np.array([[10.0, -50, -50], [10, 50, -50], [10, 0, 50]]), np.array([[0, 1, 2]]))
-    depth, nearest = depth_below(surface, np.array([4.0, 1, 2]))
-    assert_allclose(depth, 6.0)
-    assert_allclose(nearest, [10, 1, 2])
-    assert_allclose(depth_below(surface, np.array([13.0, 1, 2]))[0], -3.0)
-    assert depth_below(Surface(np.zeros((5, 3)), np.empty((0, 3), dtype=int)), np.zeros(3)) == (None, None)

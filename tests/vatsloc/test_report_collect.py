@@ -90,3 +90,13 @@ def test_page_of_a_result_shows_every_stage(case, result):
     ):
         assert words in page
     assert 'id="nodule-lps">7.0, -8.0, 9.0<' in page
+
+
+def test_motion_takes_the_inflated_border_to_the_deflated_one_in_one_frame(case, result):
+    motion = report_data(case, result).motion
+    assert_allclose(motion.after, 10.0 * np.vstack([np.zeros(3), np.eye(3)]))
+    assert_allclose(motion.before, RIGID2(20.0 * np.vstack([np.zeros(3), np.eye(3)])))
+    assert_allclose(motion.nodule_before, RIGID2(INFLATED[None])[0])
+    corners = motion.after[motion.triangles]
+    outward = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert (np.einsum("nd,nd->n", outward, corners.mean(axis=1) - motion.after.mean(axis=0)) > 0).all()

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from poro.mesh import TetMesh, TriSurface, closest_points
+from poro.mesh import TetMesh
 from registration.rigid import RigidTransform
 from registration.volume import Array
 from vatsloc.case import Case
 from vatsloc.formats.meshes import Surface, TetraMesh
 from vatsloc.frames import flip_points
-from vatsloc.report.data import LUNG, MESH, Comparison, Nodule, Outline, Picture, ReportData
+from vatsloc.report.data import LUNG, MESH, Comparison, Motion, Nodule, Outline, Picture, ReportData
+from vatsloc.report.landmarks import depth_below, surface_landmarks
 from vatsloc.results import ResultData, RunRecord
 
 
@@ -65,21 +66,27 @@ def report_data(case: Case, result: ResultData, pictures: tuple[Picture, ...] = 
         ),
     )
     depth, nearest = depth_below(result.deflated_surface, result.nodule_deflated_ras)
+    landmarks = () if nearest is None else surface_landmarks(result.deflated_surface, result.contact_surface, nearest)
     return ReportData(
-        case.folder.resolve().name, result.run.as_json(), nodule, phases, (*own, *pictures), depth, nearest
+        case_name=case.folder.resolve().name,
+        run=result.run.as_json(),
+        nodule=nodule,
+        phases=phases,
+        pictures=(*own, *pictures),
+        depth_mm=depth,
+        nearest_surface_ras=nearest,
+        landmarks=landmarks,
+        motion=_motion(result),
     )
 
 
-def depth_below(surface: Surface, point_ras: Array) -> tuple[float | None, Array | None]:
-    """Distance of a point (3,) below a surface with outward triangles, mm, negative outside, and the foot (3,) RAS mm.
-
-    Both are None for a surface without triangles.
-    """
-    if not len(surface.triangles):
-        return None, None
-    nodes = np.arange(len(surface.points_ras))
-    near = closest_points(TriSurface(surface.points_ras, surface.triangles, nodes), np.reshape(point_ras, (1, 3)))
-    return -float(near.distance[0]), near.points[0]
+def _motion(result: ResultData) -> Motion:
+    """The lung's own nodes before and after, so that every state between is a line away."""
+    border = TetMesh(result.lung_deflated.points_ras, result.lung_deflated.tets).boundary
+    def_from_inf = RigidTransform(result.rigid_deflated_from_inflated)
+    before = def_from_inf(result.lung_inflated.points_ras[border.nodes])
+    nodule = def_from_inf(result.nodule_inflated_ras[None])[0]
+    return Motion(border.triangles, before, border.points, result.contact_surface, nodule)
 
 
 def _ellipsoid(run: RunRecord) -> Array | None:

@@ -74,11 +74,37 @@ class Picture:
 
 
 @dataclass(frozen=True)
+class Motion:
+    """The collapse, in the deflated CBCT's frame, RAS mm. triangles: (m, 3), outward; before, after: (n, 3) the lung's
+    surface; cage: what it may not pass; nodule_before: (3,).
+    """
+
+    triangles: Array
+    before: Array
+    after: Array
+    cage: Surface
+    nodule_before: Array
+
+
+@dataclass(frozen=True)
+class Landmark:
+    """A place of the lung's surface that can be told by eye. at_ras: (3,) mm; away_mm: from the point nearest to the
+    nodule, in a straight line; visible: whether pleural gas lies before it.
+    """
+
+    name: str
+    at_ras: Array
+    away_mm: float
+    visible: bool
+
+
+@dataclass(frozen=True)
 class ReportData:
     """Everything report.html shows. run: the dict of run.json; phases: the last one feeds the slice viewer.
 
     depth_mm: nodule centre below the deflated surface, negative outside; nearest_surface_ras: (3,) mm, the closest
-    point of that surface. Both None where no deflated surface was found.
+    point of that surface. Both None where no deflated surface was found. landmarks: of that surface, nearest first.
+    motion: for the view in three dimensions, None where there is none.
     """
 
     case_name: str
@@ -88,6 +114,8 @@ class ReportData:
     pictures: tuple[Picture, ...] = ()
     depth_mm: float | None = None
     nearest_surface_ras: Array | None = None
+    landmarks: tuple[Landmark, ...] = ()
+    motion: Motion | None = None
     window_hu: tuple[float, float] = (-1000.0, 250.0)
 
 

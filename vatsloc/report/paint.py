@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Sequence
 
 import cv2
 import numpy as np
@@ -40,7 +39,7 @@ def bgr(colour: str) -> tuple[int, int, int]:
 
 
 def draw_outline(image: Array, plane: Plane, outline: Outline, thickness: int = 1) -> None:
-    """Draw a surface's section or a mask's border on BGR or BGRA pixels of the plane, in place."""
+    """Draw a surface's section or a mask's border on BGR pixels of the plane, in place."""
     if isinstance(outline.shape, Surface):
         _lines(image, section(outline.shape, plane), False, outline.colour, thickness)
     else:
@@ -57,37 +56,18 @@ def draw_nodule(image: Array, plane: Plane, nodule: Nodule, thickness: int = 2) 
     if away > max(2.0, float(np.linalg.norm(plane.right))):
         return
     at = plane.to_pixels(nodule.centre_ras)
-    cv2.circle(image, _fixed_point(at), 3 << (SHIFT - 1), _colour(image, NODULE), cv2.FILLED, cv2.LINE_AA, SHIFT)
+    cv2.circle(image, _fixed_point(at), 3 << (SHIFT - 1), bgr(NODULE), cv2.FILLED, cv2.LINE_AA, SHIFT)
     for direction in ((1, 0), (-1, 0), (0, 1), (0, -1)):
         arm = np.array(direction, dtype=float)
         _lines(image, [np.array([at + 9 * arm, at + 16 * arm])], False, NODULE, 1)
 
 
-def layer(plane: Plane, outlines: Sequence[Outline], nodule: Nodule | None) -> Array:
-    """Outlines alone on a transparent ground, BGRA."""
-    image = np.zeros((*plane.shape, 4), dtype=np.uint8)
-    for outline in outlines:
-        draw_outline(image, plane, outline)
-    if nodule is not None:
-        draw_nodule(image, plane, nodule)
-    return image
-
-
 def jpeg(image: Array, quality: int = 82) -> str:
     """Data URI of grey or BGR pixels."""
-    return _uri(".jpg", "image/jpeg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
-
-
-def png(image: Array) -> str:
-    """Data URI of grey, BGR or BGRA pixels, without loss."""
-    return _uri(".png", "image/png", image, [cv2.IMWRITE_PNG_COMPRESSION, 6])
-
-
-def _uri(extension: str, mime: str, image: Array, options: list[int]) -> str:
-    done, data = cv2.imencode(extension, image, options)
+    done, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
     if not done:
-        raise ValueError(f"pixels of shape {image.shape}, {image.dtype} cannot be encoded as {mime}")
-    return f"data:{mime};base64,{base64.b64encode(data.tobytes()).decode()}"
+        raise ValueError(f"pixels of shape {image.shape}, {image.dtype} cannot be encoded as JPEG")
+    return f"data:image/jpeg;base64,{base64.b64encode(data.tobytes()).decode()}"
 
 
 def _borders(mask: Mask, plane: Plane) -> list[Array]:
@@ -104,13 +84,9 @@ def _lines(image: Array, lines: Array | list[Array], closed: bool, colour: str, 
             points = [np.rint(line * scale).astype(np.int32) for line in lines]
         else:
             points = list(np.rint(lines * scale).astype(np.int32))
-        cv2.polylines(image, points, closed, _colour(image, colour), thickness, cv2.LINE_AA, SHIFT)
+        cv2.polylines(image, points, closed, bgr(colour), thickness, cv2.LINE_AA, SHIFT)
 
 
 def _fixed_point(at: Array) -> tuple[int, int]:
     x, y = np.rint(at * (1 << SHIFT)).astype(int)
     return int(x), int(y)
-
-
-def _colour(image: Array, colour: str) -> tuple[int, ...]:
-    return (*bgr(colour), 255) if image.shape[2] == 4 else bgr(colour)

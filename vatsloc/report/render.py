@@ -15,9 +15,10 @@ from markupsafe import Markup
 from registration.volume import Array, Grid
 from vatsloc.frames import flip_points
 from vatsloc.report.charts import bars, box_plot
-from vatsloc.report.data import NODULE, Comparison, Outline, Picture, ReportData, TreSection
+from vatsloc.report.data import LUNG, MESH, NODULE, SURFACE, Comparison, Picture, ReportData, TreSection
 from vatsloc.report.paint import as_bgr, draw_nodule, draw_outline, green_magenta, grey, jpeg
 from vatsloc.report.planes import AXES, EDGE_LETTERS, Plane, box_of, plane_through, sample
+from vatsloc.report.scene import scene
 from vatsloc.report.stack import stacks
 
 STILL_PIXELS = 480
@@ -80,14 +81,14 @@ def render(data: ReportData) -> str:
         nearest_lps=None if data.nearest_surface_ras is None else flip_points(data.nearest_surface_ras),
         semi_axes=_semi_axes(data),
         viewer=viewer,
-        viewer_json=_script_json([s.as_json() for s in viewer]),
+        scene_json=_script_json(scene(data, viewer)),
+        mark=next((mark for mark in data.landmarks if mark.visible), None),
         phases=[(phase, _before_after(phase, data.window_hu)) for phase in data.phases],
         pictures=[(picture, _views(picture, data.window_hu)) for picture in data.pictures],
         seconds_chart=bars(stages, "s", "seconds per stage") if stages else None,
         memory_chart=bars(memory, "MB", "highest memory per stage") if memory else None,
         rest={k: json.dumps(v, indent=1, default=str) for k, v in data.run.items() if k not in _SHOWN},
-        nodule_colour=NODULE,
-        legend=_legend(data),
+        colours={"nodule": NODULE, "lung": LUNG, "cage": MESH, "inflated": SURFACE},
         scores_from=Markup(SCORES_FROM),
         scores_to=Markup(SCORES_TO),
     )
@@ -175,10 +176,6 @@ def _semi_axes(data: ReportData) -> list[float] | None:
         return sorted(np.linalg.norm(data.nodule.ellipsoid, axis=1).tolist(), reverse=True)
     lengths = data.run.get("nodule_ellipsoid95_mm")
     return None if lengths is None or None in lengths else sorted(lengths, reverse=True)
-
-
-def _legend(data: ReportData) -> list[Outline]:
-    return list({o.name: o for o in (data.phases[-1].outlines if data.phases else ())}.values())
 
 
 def _script_json(value: Any) -> Markup:

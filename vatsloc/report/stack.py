@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
@@ -10,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from registration.volume import Array
-from vatsloc.report.data import Comparison, Nodule, Outline
-from vatsloc.report.paint import grey, jpeg, layer, png
+from vatsloc.report.data import Comparison
+from vatsloc.report.paint import grey, jpeg
 from vatsloc.report.planes import AXES, EDGE_LETTERS, Plane, box_of, plane_through, sample
 
 SLICES = 40
@@ -20,14 +19,13 @@ LARGEST_PIXELS = 256
 
 @dataclass(frozen=True)
 class Stack:
-    """One plane's slices from first to last. images: data URIs of the fixed and moving image and of the outlines."""
+    """One plane's slices from first to last. images: data URIs of the fixed and moving image."""
 
     plane: Plane
     positions_mm: Array
     start: int
     fixed: list[str]
     moving: list[str]
-    lines: list[str]
 
     def as_json(self) -> dict[str, Any]:
         """What the viewer's script needs; lengths in mm, RAS."""
@@ -44,7 +42,6 @@ class Stack:
             "edges": EDGE_LETTERS[self.plane.name],
             "fixed": self.fixed,
             "moving": self.moving,
-            "lines": self.lines,
         }
 
 
@@ -77,18 +74,10 @@ def _stack(
     fixed, moving = (
         [jpeg(grey(sample(v, plane), window_hu), 75) for plane in planes] for v in (comparison.fixed, comparison.after)
     )
-    lines = [png(_sharp_layer(plane, comparison.outlines, comparison.nodule)) for plane in planes]
-    return Stack(planes[start], positions, start, fixed, moving, lines)
+    return Stack(planes[start], positions, start, fixed, moving)
 
 
 def _at(name: str, centre: Array, position: float, box: tuple[Array, Array], spacing: float) -> Plane:
     at = np.array(centre, dtype=float)
     at[AXES[name]] = position
     return plane_through(name, at, box, spacing)
-
-
-def _sharp_layer(plane: Plane, outlines: Sequence[Outline], nodule: Nodule) -> Array:
-    """Outlines at twice the image's resolution: lines are enlarged on screen, and should not look it."""
-    rows, columns = plane.shape
-    corner = plane.origin - (plane.right + plane.down) / 4
-    return layer(Plane(plane.name, corner, plane.right / 2, plane.down / 2, (2 * rows, 2 * columns)), outlines, nodule)
