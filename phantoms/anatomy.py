@@ -49,10 +49,11 @@ class Shapes:
         return self.right_lung if side == "right" else self.left_lung
 
 
-def draw_build(rng: np.random.Generator) -> Build:
-    """Measures of a person, drawn within adult variation."""
+def draw_build(rng: np.random.Generator, habitus: str = "average") -> Build:
+    """Measures of a person, drawn within adult variation. habitus: "average", or "obese" with a high diaphragm."""
+    obese = habitus == "obese"
     size = rng.uniform(0.94, 1.05)
-    dome = -102 * size + rng.uniform(-6, 6)
+    dome = -102 * size + rng.uniform(-6, 6) + 16 * obese
     centre = np.array([-20, 22, -66]) * size + rng.uniform(-4, 4, 3)
     radii = np.array([50, 43, 54]) * size * rng.uniform(0.94, 1.06, 3)
     return Build(
@@ -60,10 +61,10 @@ def draw_build(rng: np.random.Generator) -> Build:
         depth=88 * size * rng.uniform(0.96, 1.06),
         apex=120 * size,
         dome=(dome, dome - rng.uniform(6, 16)),
-        fat=(rng.uniform(8, 22), rng.uniform(10, 20)),
+        fat=(rng.uniform(8, 22) + 16 * obese, rng.uniform(10, 20) + 22 * obese),
         heart=np.stack([centre, radii]),
         spine_bow=rng.uniform(8, 16),
-        mediastinum=rng.uniform(24, 30),
+        mediastinum=rng.uniform(24, 30) + 4 * obese,
     )
 
 

@@ -12,10 +12,10 @@ from scipy import ndimage
 from phantoms.cbct import expose, scanner_grid
 from phantoms.fields import Lattice, coverage
 from phantoms.imaging import Picture, State, image_state, nodule_mask
+from phantoms.measures import measure
 from phantoms.spec import SPECS, PhantomSpec
 from phantoms.states import make_states, scanned_centre
-from phantoms.thorax import NODULE_HU, Thorax, ct_grid, draw_lung_trees, draw_thorax, image_body
-from phantoms.tissue import Equilibrium
+from phantoms.thorax import Thorax, ct_grid, draw_lung_trees, draw_thorax, image_body
 from registration.volume import Grid, Mask, Volume
 
 Array = NDArray[Any]
@@ -60,18 +60,19 @@ def make_case(spec: PhantomSpec | str, seed: int = 0) -> PhantomCase:
     if spec.side not in ("right", "left"):
         raise ValueError(f"side must be 'right' or 'left', got {spec.side!r}")
     rng = np.random.default_rng([seed, 11])
-    thorax = draw_thorax(spec.side, spec.nodule_depth, spec.nodule_radius, seed)
+    thorax = draw_thorax(spec.side, spec.habitus, spec.lesion, seed)
     lung = thorax.shapes.lung(spec.side)
     lung = lung.crop(lung.values < 0, 24.0)
     states, gravity, ends = make_states(thorax, lung, spec, rng)
     ct, body, ct_lung = _ct(thorax, lung, spec, rng)
-    grid = scanner_grid(scanned_centre(thorax), spec.cbct_spacing, spec.cbct_length, spec.scanner.fov)
+    view = scanned_centre(thorax) + spec.view
+    grid = scanner_grid(view, spec.cbct_spacing, spec.scanner.length, spec.scanner.fov)
     grids = [_moved_grid(grid, s) for s in states]
     pictures = [image_state(thorax, body, s, g) for s, g in zip(states, grids, strict=True)]
     shots = [expose(p.clean, spec.scanner, rng) for p in pictures]
     nodule = nodule_mask(thorax.nodule, ct.grid)
     nodule_points = [_nodule_centre(thorax, s) for s in states]
-    ct_marks = _landmarks(thorax, lung, states, grids, rng)
+    ct_marks = _landmarks(thorax, lung, states, grids, spec.scanner.fov, rng)
     marks = [s.from_ct(ct_marks) for s in states]
     tissue = states[0].samples[lung.sample(states[0].samples) < -1.0]
     dense_ct = tissue[rng.permutation(len(tissue))[:2000]]
@@ -97,7 +98,7 @@ def make_case(spec: PhantomSpec | str, seed: int = 0) -> PhantomCase:
         inflated=states[0],
         deflated=states[1],
         masks=_masks(ct_lung, pictures),
-        info=_info(states, ct_marks, dense_ct, ends),
+        info=measure(states, ct_marks, dense_ct, ends),
     )
 
 
@@ -133,7 +134,7 @@ def _paint_nodule(hu: Array, grid: Grid, thorax: Thorax, width: float) -> None:
     lo = np.maximum(np.floor(corners.min(axis=0)), 0).astype(int)
     sub = grid.box(lo, corners.max(axis=0) + 1)
     view = hu[tuple(slice(a, a + n) for a, n in zip(lo, sub.shape, strict=True))]
-    view += coverage(thorax.nodule.distance(sub.points()), width) * (NODULE_HU - view)
+    view += coverage(thorax.nodule.distance(sub.points()), width) * (thorax.nodule.density(sub.points()) - view)
 
 
 def _nodule_centre(thorax: Thorax, state: State) -> Array:
@@ -146,7 +147,12 @@ def _nodule_centre(thorax: Thorax, state: State) -> Array:
 
 
 def _landmarks(
-    thorax: Thorax, lung: Lattice, states: tuple[State, State], grids: list[Grid], rng: np.random.Generator
+    thorax: Thorax,
+    lung: Lattice,
+    states: tuple[State, State],
+    grids: list[Grid],
+    fov: float,
+    rng: np.random.Generator,
 ) -> Array:
     """Forks of vessels and airways in the CT, RAS mm, that both cone-beam images show, spread far apart."""
     trees = thorax.trees[thorax.index(thorax.side)]
@@ -160,7 +166,7 @@ def _landmarks(
         ijk = grid.to_ijk(state.from_ct(points))
         off = (ijk - (np.array(grid.shape) - 1) / 2) * grid.spacing
         half = grid.shape[2] * grid.spacing[2] / 2
-        points = points[(np.hypot(off[:, 0], off[:, 1]) < 112) & (np.abs(off[:, 2]) < half - 14)]
+        points = points[(np.hypot(off[:, 0], off[:, 1]) < fov / 2 - 8) & (np.abs(off[:, 2]) < half - 14)]
     chosen = [int(rng.integers(len(points)))]
     reach = np.linalg.norm(points - points[chosen[0]], axis=1)
     while len(chosen) < min(48, len(points)):
@@ -176,23 +182,4 @@ def _masks(ct_lung: Mask, pictures: list[Picture]) -> dict[str, Mask]:
         "lung_deflated": pictures[1].lung,
         "nodule_inflated": pictures[0].nodule,
         "nodule_deflated": pictures[1].nodule,
-    }
-
-
-def _info(states: tuple[State, State], marks: Array, dense: Array, ends: list[Equilibrium]) -> dict[str, Any]:
-    inflated, deflated = (s.lung_map for s in states)
-    pose = np.linalg.norm(inflated(marks) - marks, axis=1)
-    collapse = np.linalg.norm(deflated(marks) - inflated(marks), axis=1)
-    total = np.linalg.norm(deflated(marks) - marks, axis=1)
-    return {
-        "n_landmarks": len(marks),
-        "pose_mm": [float(pose.mean()), float(pose.max())],
-        "pneumothorax_mm": [float(collapse.mean()), float(collapse.max())],
-        "total_mm": [float(total.mean()), float(total.max())],
-        "volume_ratio": [float(m.determinant(dense).mean()) for m in (inflated, deflated)],
-        "smallest_determinant": [float(m.determinant(states[0].samples).min()) for m in (inflated, deflated)],
-        "dome_mm": [s.motion.operated_dome for s in states],
-        "pose": [s.pose.tolist() for s in states],
-        "equilibrium": [e.status.name for e in ends],
-        "steps": [len(e.history) for e in ends],
     }

@@ -18,10 +18,12 @@ OUTSIDE_HU = -1000.0
 
 @dataclass(frozen=True)
 class Scanner:
-    """Cone-beam scanner. fov: mm diameter; blur: mm standard deviation; cupping: share of the signal lost in the
-    middle; rim: share gained at the edge of the field of view; noise: HU; end: mm of bad slices at either end."""
+    """Cone-beam scanner. fov: mm diameter; length: mm it shows along the patient; blur: mm standard deviation;
+    cupping: share of the signal lost in the middle; rim: share gained at the edge of the field of view; noise: HU;
+    end: mm of bad slices at either end."""
 
     fov: float = 240.0
+    length: float = 170.0
     blur: float = 0.9
     cupping: float = 0.06
     rim: float = 0.10

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from phantoms.cage import CageMotion
 from phantoms.fields import Lattice, coverage, refine, smoothstep
 from phantoms.spline import SplineMap, determinant
-from phantoms.thorax import NODULE_HU, LungTrees, Nodule, Thorax, draw_lung_trees
+from phantoms.thorax import LungTrees, Nodule, Thorax, draw_lung_trees
 from registration.volume import Grid, Mask, Volume
 
 Array = NDArray[Any]
@@ -72,9 +72,9 @@ def image_state(thorax: Thorax, body: Volume, state: State, grid: Grid) -> Pictu
     edge = state.lung.sample(source) * np.cbrt(ratio)
     share = np.ones_like(edge) if state.held else coverage(edge, width)
     resting = thorax.parenchyma.sample(source) + thorax.fissure.density(source)
-    tissue = np.minimum((resting + 1000) / ratio - 1000, 40.0)
     lesion = coverage(thorax.nodule.distance(source) * np.cbrt(ratio), width) * share
-    tissue += lesion * (NODULE_HU - tissue)
+    resting += lesion * (thorax.nodule.density(source) - resting)
+    tissue = np.minimum((resting + 1000) / ratio - 1000, 40.0)
     inner = PLEURAL_AIR_HU + share * (tissue - PLEURAL_AIR_HU)
     flat = hu.ravel()
     flat[within] += room[within] * (inner - flat[within])

@@ -1,4 +1,4 @@
-"""What phantoms there are: named choices of side, collapse, nodule, voxels and scanner."""
+"""What phantoms there are: named choices of person, side, nodule, collapse, voxels and scanner."""
 
 from __future__ import annotations
 
@@ -8,38 +8,87 @@ from phantoms.cbct import Scanner
 
 
 @dataclass(frozen=True)
-class PhantomSpec:
-    """What to make. side: operated; ct_spacing, cbct_spacing: mm; inflated, deflated: lung volume over that in the CT;
-    dome_rise: mm the diaphragm rises further when the lung collapses; element: mm between nodes of the
-    lung's map; patchiness: factor on how uneven the tissue is; nodule_depth, nodule_radius: mm."""
+class Lesion:
+    """The nodule. kind: "solid", "part-solid" or "ground-glass"; place: "middle", "apex" or "base" of the lung; depth
+    below the pleura and radius: mm."""
 
-    name: str
-    side: str
-    ct_spacing: tuple[float, float, float] = (1.2, 1.2, 1.5)
-    cbct_spacing: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    cbct_length: float = 170.0
+    kind: str = "solid"
+    place: str = "middle"
+    depth: float = 15.0
+    radius: float = 8.0
+
+
+@dataclass(frozen=True)
+class Collapse:
+    """What happens to the lung between the images. inflated, deflated: volume over that in the CT; dome_rise: mm the
+    diaphragm rises further when the lung collapses, negative where insufflated gas pushes it down; shift: mm the
+    mediastinum falls; gas: "air" or "co2"; patchiness: factor on how uneven the tissue is; atelectasis: share of the
+    lung, behind and below, that has lost its gas before the first cone-beam CT."""
+
     inflated: float = 0.87
     deflated: float = 0.52
     dome_rise: float = 8.0
-    element: float = 15.0
+    shift: float = 11.0
+    gas: str = "air"
     patchiness: float = 1.0
-    nodule_depth: float = 15.0
-    nodule_radius: float = 8.0
+    atelectasis: float = 0.0
+
+
+@dataclass(frozen=True)
+class PhantomSpec:
+    """What to make. side: operated; habitus: "average" or "obese"; ct_spacing, cbct_spacing: mm; view: (3,) mm the
+    cone-beam CTs' field of view is off its usual place; element: mm between nodes of the lung's map; refused: whether
+    the images show too little for an answer."""
+
+    name: str
+    side: str
+    habitus: str = "average"
+    ct_spacing: tuple[float, float, float] = (1.2, 1.2, 1.5)
+    cbct_spacing: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    view: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    element: float = 15.0
+    refused: bool = False
+    lesion: Lesion = field(default_factory=Lesion)
+    collapse: Collapse = field(default_factory=Collapse)
     scanner: Scanner = field(default_factory=Scanner)
 
 
-_SMALL = PhantomSpec("small", "right", (1.5, 1.5, 2.0), (1.5, 1.5, 1.5), element=18.0)
+_SMALL = PhantomSpec("small", "right", ct_spacing=(1.5, 1.5, 2.0), cbct_spacing=(1.5, 1.5, 1.5), element=18.0)
+_CO2 = Collapse(dome_rise=-14.0, shift=16.0, gas="co2")
 SPECS = {
     s.name: s
     for s in (
-        replace(_SMALL, name="demo", inflated=0.89, deflated=0.55, patchiness=0.6),
+        replace(_SMALL, name="demo", collapse=Collapse(inflated=0.89, deflated=0.55, patchiness=0.6)),
         replace(_SMALL, name="small-right"),
         replace(_SMALL, name="small-left", side="left"),
         PhantomSpec("right", "right"),
-        PhantomSpec("left", "left", inflated=0.83, nodule_depth=25.0),
-        PhantomSpec("small-collapse", "right", deflated=0.64, dome_rise=0.0),
-        PhantomSpec("near-total-collapse", "left", deflated=0.42, dome_rise=12.0),
-        PhantomSpec("high-diaphragm", "right", dome_rise=20.0, nodule_depth=10.0),
-        PhantomSpec("poor-dose", "left", scanner=Scanner(noise=60.0, blur=0.9), nodule_radius=6.0),
+        PhantomSpec("left", "left", lesion=Lesion(depth=25.0), collapse=Collapse(inflated=0.83)),
+        PhantomSpec("small-collapse", "right", collapse=Collapse(deflated=0.64, dome_rise=0.0)),
+        PhantomSpec("near-total-collapse", "left", collapse=Collapse(deflated=0.40, dome_rise=12.0)),
+        PhantomSpec("co2-right", "right", lesion=Lesion(depth=20.0, radius=6.0), collapse=_CO2),
+        PhantomSpec("co2-left", "left", lesion=Lesion(radius=10.0), collapse=replace(_CO2, deflated=0.46)),
+        PhantomSpec("high-diaphragm", "right", "obese", lesion=Lesion(depth=10.0), collapse=Collapse(dome_rise=14.0)),
+        PhantomSpec("apex", "left", view=(0.0, 0.0, 45.0), lesion=Lesion(place="apex", depth=12.0, radius=7.0)),
+        PhantomSpec("base", "right", lesion=Lesion(place="base", depth=10.0), collapse=Collapse(patchiness=1.4)),
+        PhantomSpec("ground-glass", "right", lesion=Lesion("ground-glass", depth=18.0, radius=9.0)),
+        PhantomSpec("part-solid", "left", lesion=Lesion("part-solid", radius=11.0)),
+        PhantomSpec(
+            "tight-view",
+            "left",
+            view=(0.0, 0.0, 38.0),
+            lesion=Lesion(radius=7.0),
+            scanner=Scanner(fov=190.0, length=130.0),
+        ),
+        PhantomSpec("poor-dose", "left", lesion=Lesion(radius=6.0), scanner=Scanner(noise=60.0)),
+        PhantomSpec("atelectasis", "right", collapse=Collapse(atelectasis=0.10)),
+        PhantomSpec(
+            "too-little-seen",
+            "right",
+            view=(36.0, 0.0, -44.0),
+            refused=True,
+            scanner=Scanner(fov=120.0, length=80.0),
+        ),
     )
 }
+SUITE = {name: 100 + n for n, name in enumerate(list(SPECS)[3:])}
+"""Cases that cover the clinic, by name, and the seed of each one's person."""

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from phantoms.cage import CageMotion, fit_dome
-from phantoms.fields import Lattice, coverage, smooth_noise
+from phantoms.fields import Lattice, coverage, smooth_noise, smoothstep
 from phantoms.imaging import State
-from phantoms.spec import PhantomSpec
+from phantoms.spec import Collapse, PhantomSpec
 from phantoms.thorax import Thorax
 from phantoms.tissue import Equilibrium, Hilum, Pleura, Tissue, pleura_points, relax, tissue_points
 
@@ -27,9 +27,13 @@ def make_states(
     lung: signed distance (mm) of that lung in the CT. Gravity acts from the operated side to the other.
     """
     sign = 1 if spec.side == "right" else -1
-    inflated_motion = fit_dome(CageMotion(thorax.build, sign, 0.0, 16.0, 5.0, 6.0), lung, spec.inflated)
+    collapse = spec.collapse
+    inflated_motion = fit_dome(CageMotion(thorax.build, sign, 0.0, 16.0, 5.0, 6.0), lung, collapse.inflated)
     deflated_motion = replace(
-        inflated_motion, operated_dome=inflated_motion.operated_dome + spec.dome_rise, shift=11.0, squeeze=4.0
+        inflated_motion,
+        operated_dome=inflated_motion.operated_dome + collapse.dome_rise,
+        shift=collapse.shift,
+        squeeze=4.0,
     )
     gravity = np.array([-sign, 0.15, 0.05]) + rng.normal(0, 0.03, 3)
     gravity /= np.linalg.norm(gravity)
@@ -37,8 +41,8 @@ def make_states(
     surface, area = pleura_points(lung, 2)
     hilum = thorax.hila[thorax.index(spec.side)]
     tied = points[np.linalg.norm(points - hilum, axis=1) < 20]
-    shear, slack = _uneven(thorax, lung, points, spec.patchiness, rng)
-    rest = np.cbrt(np.clip(spec.deflated * slack, 0.15, 0.95))
+    shear, slack = _uneven(thorax, lung, points, collapse, rng)
+    rest = np.cbrt(np.clip(collapse.deflated * slack, 0.15, 0.95))
     poses = _poses(scanned_centre(thorax), rng)
     states, ends = [], []
     for motion, held, pose in ((inflated_motion, True, poses[0]), (deflated_motion, False, poses[1])):
@@ -49,7 +53,7 @@ def make_states(
             Hilum(tied, motion(tied), 300.0),
             gravity,
             motion,
-            None if held else spec.deflated,
+            None if held else collapse.deflated,
             spec.element,
         )
         ends.append(end)
@@ -58,16 +62,31 @@ def make_states(
 
 
 def _uneven(
-    thorax: Thorax, lung: Lattice, points: Array, patchiness: float, rng: np.random.Generator
+    thorax: Thorax, lung: Lattice, points: Array, collapse: Collapse, rng: np.random.Generator
 ) -> tuple[Array, Array]:
-    """Shear modulus (kPa) and factor on the rest volume: patchy tissue, soft fissure, stiff root and nodule."""
+    """Shear modulus (kPa) and factor on the rest volume: patchy tissue, soft fissure, stiff root, airless tissue and
+    nodule."""
+    patchiness = collapse.patchiness
     hilum = thorax.hila[thorax.index(thorax.side)]
     shear = 0.65 * np.exp(0.45 * patchiness * lung.like(smooth_noise(lung, 32.0, rng)).at(points))
     slack = np.exp(0.22 * patchiness * lung.like(smooth_noise(lung, 38.0, rng)).at(points))
     shear *= 1 + 5 * np.exp(-((np.linalg.norm(points - hilum, axis=1) / 24) ** 2))
     shear *= 1 - 0.85 * np.exp(-((thorax.fissure.distance(points) / 8) ** 2))
+    airless = _airless(points, collapse.atelectasis)
+    shear *= 1 + 5 * airless
+    slack *= 1 - 0.75 * airless
     lesion = coverage(thorax.nodule.distance(points), 8.0)
-    return shear * (1 + 10 * lesion), slack + lesion * (1.6 - slack)
+    return shear * (1 + (thorax.nodule.stiffening - 1) * lesion), slack + lesion * (1.6 - slack)
+
+
+def _airless(points: Array, share: float) -> Array:
+    """One (n,) in the `share` of the lung that lies furthest back and down, zero in front, smooth over 12 mm."""
+    down = -points @ np.array([0.0, 0.8, 0.6])
+    return (
+        smoothstep(down, *(np.quantile(down, 1 - share) + np.array([-6.0, 6.0])))
+        if share > 0
+        else np.zeros(len(points))
+    )
 
 
 def _poses(centre: Array, rng: np.random.Generator) -> tuple[Array, Array]:

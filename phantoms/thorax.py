@@ -12,11 +12,13 @@ from scipy import ndimage
 from phantoms.anatomy import Build, Shapes, draw_build, make_shapes, spine_y
 from phantoms.fields import Lattice, coverage, smooth_noise, smoothstep
 from phantoms.skeleton import Vertebra, draw_bones, draw_spine
+from phantoms.spec import Lesion
 from phantoms.trees import Tree, draw_tubes, grow, tubes
 from registration.volume import Grid
 
 Array = NDArray[Any]
-BLOOD_HU, WALL_HU, AIR_HU, NODULE_HU = 42.0, 10.0, -990.0, 25.0
+BLOOD_HU, WALL_HU, AIR_HU = 42.0, 10.0, -990.0
+SOLID_HU, GLASS_HU = 25.0, -560.0
 
 
 @dataclass(frozen=True)
@@ -30,11 +32,23 @@ class LungTrees:
 
 @dataclass(frozen=True)
 class Nodule:
-    """Solid lesion: a ball of radius (mm) whose surface waves by `relief` mm. centre: (3,) RAS mm in the CT."""
+    """A ball of radius (mm) whose surface waves by `relief` mm. centre: (3,) RAS mm in the CT; kind: see `Lesion`."""
 
     centre: Array
     radius: float
     relief: float
+    kind: str
+
+    @property
+    def stiffening(self) -> float:
+        """Factor on the shear modulus of lung tissue."""
+        return {"solid": 11.0, "part-solid": 6.0, "ground-glass": 2.0}[self.kind]
+
+    def density(self, points: Array) -> Array:
+        """HU in the CT at points (..., 3) of the lesion; a part-solid one has a solid core of half its radius."""
+        core = {"solid": np.inf, "part-solid": 0.5 * self.radius, "ground-glass": -np.inf}[self.kind]
+        depth = np.linalg.norm(points - self.centre, axis=-1) - core
+        return GLASS_HU + smoothstep(-depth, -1.0, 1.0) * (SOLID_HU - GLASS_HU)
 
     def distance(self, points: Array) -> Array:
         """Signed distance in mm of points (..., 3), negative inside."""
@@ -89,16 +103,16 @@ class Thorax:
         return 0 if side == "right" else 1
 
 
-def draw_thorax(side: str, nodule_depth: float, nodule_radius: float, seed: int) -> Thorax:
-    """Person with a nodule `nodule_depth` mm below the pleura of the lung on `side`, drawn from a seed."""
+def draw_thorax(side: str, habitus: str, lesion: Lesion, seed: int) -> Thorax:
+    """Person with a lesion in the lung on `side`, drawn from a seed."""
     rng = np.random.default_rng([seed, 1])
-    build = draw_build(rng)
+    build = draw_build(rng, habitus)
     shapes = make_shapes(build)
     spine = draw_spine(build, float(shapes.body.origin[2]), build.apex + 16, rng)
     hila = (_hilum(shapes.right_lung, 1), _hilum(shapes.left_lung, -1))
     trees = (_lung_trees(shapes.right_lung, hila[0], 1, rng), _lung_trees(shapes.left_lung, hila[1], -1, rng))
-    centre = _place_nodule(shapes.lung(side), nodule_depth, 1 if side == "right" else -1, rng)
-    nodule = Nodule(centre, nodule_radius, 0.12 * nodule_radius)
+    centre = _place_nodule(shapes.lung(side), build, lesion, 1 if side == "right" else -1, rng)
+    nodule = Nodule(centre, lesion.radius, 0.12 * lesion.radius, lesion.kind)
     fissure = Fissure(hila[0 if side == "right" else 1], rng.uniform(0.7, 1.1), rng.uniform(-8, 8))
     return Thorax(shapes, spine, _parenchyma(shapes, rng), hila, trees, nodule, fissure, side, seed)
 
@@ -259,12 +273,18 @@ def _keep_inside(tree: Tree, lung: Lattice) -> Array:
     return nodes
 
 
-def _place_nodule(lung: Lattice, depth: float, sign: int, rng: np.random.Generator) -> Array:
+def _place_nodule(lung: Lattice, build: Build, lesion: Lesion, sign: int, rng: np.random.Generator) -> Array:
     points = lung.points()
-    distance = lung.values.ravel()
-    apt = (np.abs(distance + depth) < 1.5) & (np.abs(points[:, 2] + 45) < 45) & (sign * points[:, 0] > 55)
+    apt = np.abs(lung.values.ravel() + lesion.depth) < 1.5
+    z, dome = points[:, 2], build.dome[0 if sign == 1 else 1]
+    level, inner = {
+        "middle": (np.abs(z + 45) < 45, 55),
+        "apex": (z > 0.52 * build.apex, 20),
+        "base": (z < dome + 1.5 * lesion.depth, 45),
+    }[lesion.place]
+    apt &= level & (sign * points[:, 0] > inner)
     if not apt.any():
-        raise ValueError(f"no place {depth:g} mm below the pleura, choose a nodule depth between 6 and 45 mm")
+        raise ValueError(f"no place {lesion.depth:g} mm below the pleura, choose a nodule depth between 6 and 45 mm")
     return points[apt][rng.integers(int(apt.sum()))] + rng.uniform(-1, 1, 3)
 
 

@@ -81,15 +81,25 @@ def evaluate(
 
 @app.command()
 def phantom(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the phantom, for instance demo.")],
-    out: Annotated[Path, typer.Option("--out", metavar="CASE", help="Case folder to write.")],
+    name: Annotated[str | None, typer.Argument(metavar="NAME", help="Name of the phantom, for instance demo.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", metavar="CASE", help="Case folder to write.")] = None,
     seed: Annotated[int, typer.Option(metavar="N", help="Seed of the anatomy.")] = 0,
+    suite: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Write every case of the suite; those there are kept.")
+    ] = None,
+    jobs: Annotated[int, typer.Option(metavar="N", min=1, help="Cases of the suite made at once.")] = 1,
 ) -> None:
-    """Write a synthetic case with known truth."""
+    """Write a synthetic case with known truth, or the whole suite with a table of how hard its cases are."""
     from vatsloc.phantom_case import write_phantom
+    from vatsloc.study.suite import table, write_suite
 
-    write_phantom(name, out, seed, say)
-    print(out)
+    if suite is not None and name is None and out is None:
+        print(table(write_suite(suite, jobs, say)))
+    elif suite is None and name is not None and out is not None:
+        write_phantom(name, out, seed, say)
+        print(out)
+    else:
+        raise CaseError("phantom makes one case (NAME --out CASE) or the suite (--suite DIR); give one of the two.")
 
 
 @app.command()

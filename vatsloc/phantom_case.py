@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +17,7 @@ from vatsloc.formats.casefile import FILE_NAME
 from vatsloc.formats.folder import whole_folder
 from vatsloc.formats.markups import PointList, write_points
 from vatsloc.formats.nifti import write_mask, write_volume
-from vatsloc.workflow.stages import Say, quiet
+from vatsloc.workflow.stages import Say, Stages, quiet
 
 INFO_FILE = "truth/info.json"
 DENSE_HEADER = "ct_x,ct_y,ct_z,inf_x,inf_y,inf_z,def_x,def_y,def_z"
@@ -29,9 +31,27 @@ def write_phantom(name: str, folder: Path, seed: int = 0, say: Say = quiet) -> N
     if name not in SPECS:
         raise CaseError(f'"{name}" is no phantom; choose one of {", ".join(SPECS)}.')
     say(f"phantom {name}, seed {seed} ...")
+    log = Stages()
     with whole_folder(folder, (FILE_NAME, INFO_FILE), _is_phantom) as partial:
-        _write(make_case(name, seed), partial)
-    say(f"phantom written to {folder}")
+        with log.stage("phantom"):
+            made = make_case(name, seed)
+            _write(made, partial)
+        cost = {"seconds": log.seconds["phantom"], "peak_mb": log.peak_mb["phantom"]}
+        info = recipe(name, seed) | cost | made.info
+        (partial / INFO_FILE).write_text(json.dumps(info, indent=1) + "\n", encoding="utf-8")
+    say(f"{name} written to {folder}: {cost['seconds']:.0f} s, {cost['peak_mb']:.0f} MB")
+
+
+def recipe(name: str, seed: int) -> dict[str, Any]:
+    """What a phantom is made from, as its truth/info.json says it."""
+    return {"spec": json.loads(json.dumps(asdict(SPECS[name]))), "seed": seed}
+
+
+def read_info(folder: Path) -> dict[str, Any] | None:
+    """truth/info.json of the phantom in `folder`; None where there is none."""
+    if not (folder / FILE_NAME).is_file() or not (folder / INFO_FILE).is_file():
+        return None
+    return dict(json.loads((folder / INFO_FILE).read_text(encoding="utf-8")))
 
 
 def _is_phantom(folder: Path) -> bool:
@@ -60,7 +80,6 @@ def _write(phantom: PhantomCase, folder: Path) -> None:
     np.savetxt(
         truth / "dense_ras_mm.csv", phantom.dense_truth, fmt="%.3f", delimiter=",", header=DENSE_HEADER, comments=""
     )
-    (folder / INFO_FILE).write_text(json.dumps(phantom.info, indent=1) + "\n", encoding="utf-8")
     (folder / FILE_NAME).write_text(_case_file(phantom), encoding="utf-8")
 
 
@@ -83,7 +102,7 @@ mask = "nodule.nii.gz"
 
 [setup]
 gravity_cbct = [{gravity}]
-pleural_gas = "air"
+pleural_gas = "{phantom.spec.collapse.gas}"
 
 [landmarks]
 ct = "landmarks_ct.mrk.json"

@@ -15,7 +15,7 @@ from phantoms.imaging import State, image_state
 from phantoms.trees import Tree
 from registration.volume import Volume, axis_codes
 
-COARSE = PhantomSpec("coarse", "left", (4.0, 4.0, 4.0), (4.0, 4.0, 4.0), element=24.0)
+COARSE = PhantomSpec("coarse", "left", ct_spacing=(4.0, 4.0, 4.0), cbct_spacing=(4.0, 4.0, 4.0), element=24.0)
 
 
 def _states(case: PhantomCase) -> list[tuple[str, State, Volume]]:
@@ -43,8 +43,8 @@ def test_no_tissue_is_folded(demo: PhantomCase) -> None:
 def test_volumes_are_those_asked_for(demo: PhantomCase) -> None:
     inflated, deflated = demo.info["volume_ratio"]
     # The held pleura hangs a tenth of a millimetre off the wall, which costs the inflated lung some volume.
-    assert inflated == pytest.approx(demo.spec.inflated, abs=0.03)
-    assert deflated == pytest.approx(demo.spec.deflated, abs=0.015)
+    assert inflated == pytest.approx(demo.spec.collapse.inflated, abs=0.03)
+    assert deflated == pytest.approx(demo.spec.collapse.deflated, abs=0.015)
 
 
 def test_mass_of_the_lung_is_kept(demo: PhantomCase) -> None:
@@ -108,7 +108,7 @@ def test_nodule_is_seen_where_the_truth_says(demo: PhantomCase, name: str) -> No
     )
     mask = demo.masks[f"nodule_{name}"]
     assert_allclose(mask.grid.to_ras(np.argwhere(mask.inside).mean(axis=0)), truth, atol=0.3)
-    near = np.argwhere(np.linalg.norm(image.grid.points() - truth, axis=-1) < 1.15 * demo.spec.nodule_radius)
+    near = np.argwhere(np.linalg.norm(image.grid.points() - truth, axis=-1) < 1.15 * demo.spec.lesion.radius)
     bright = near[image.hu[tuple(near.T)] > -350]
     assert_allclose(image.grid.to_ras(bright.mean(axis=0)), truth, atol=1.0)
 

@@ -1,0 +1,43 @@
+"""What the suite holds, and its table."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from phantoms import SPECS, SUITE, PhantomCase
+from vatsloc.phantom_case import read_info, recipe, write_phantom
+from vatsloc.study import suite
+
+
+def test_suite_covers_the_clinic() -> None:
+    specs = [SPECS[name] for name in SUITE]
+    assert len(specs) >= 12
+    assert len(set(SUITE.values())) == len(specs)
+    assert {s.side for s in specs} == {"right", "left"}
+    assert {s.collapse.gas for s in specs} == {"air", "co2"}
+    assert {s.lesion.kind for s in specs} == {"solid", "part-solid", "ground-glass"}
+    assert {s.lesion.place for s in specs} == {"middle", "apex", "base"}
+    assert min(s.collapse.deflated for s in specs) <= 0.42
+    assert max(s.collapse.deflated for s in specs) >= 0.64
+    assert sum(s.refused for s in specs) == 1
+
+
+def test_a_case_that_is_there_is_kept_and_tabled(
+    demo: PhantomCase, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("vatsloc.phantom_case.make_case", lambda _name, _seed: demo)
+    monkeypatch.setattr(suite, "SUITE", {"demo": 0})
+    write_phantom("demo", tmp_path / "demo")
+    ct = tmp_path / "demo" / "ct.nii.gz"
+    before = ct.stat().st_mtime_ns
+    said: list[str] = []
+    made = suite.write_suite(tmp_path, say=said.append)
+    assert said == ["1 of 1 cases are there, 0 to make"]
+    assert ct.stat().st_mtime_ns == before
+    assert made["demo"] == read_info(tmp_path / "demo")
+    assert {key: made["demo"][key] for key in ("spec", "seed")} == recipe("demo", 0)
+    row = suite.table(made).splitlines()[2]
+    assert f"| {demo.info['pose_mm'][0]:.1f} / {demo.info['pose_mm'][1]:.1f} |" in row
+    assert f"| {100 * demo.info['affine_share'][1]:.0f} |" in row
