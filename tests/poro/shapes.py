@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from poro.compliance import Compliance
 from poro.mesh import TetMesh, stuff_level_set
 from poro.mesh.tetmesh import Array, signed_volumes
+from poro.solid import Solid, unknowns_of
 
 
 def box(cells: tuple[int, int, int], size: tuple[float, float, float]) -> TetMesh:
@@ -31,6 +33,13 @@ def ellipsoid(edge_mm: float, radii: tuple[float, float, float] = (40.0, 50.0, 6
     """Stuffed ellipsoid about the origin."""
     r = np.array(radii)
     return stuff_level_set(lambda p: (1 - np.linalg.norm(p / r, axis=1)) * r.min(), -r - 5, r + 5, edge_mm)
+
+
+def compliance_of(body: Solid, nodes: Array) -> Compliance:
+    """Compliance of a body's contact nodes (nc,)."""
+    place = np.full(3 * len(body.mesh.points), -1)
+    place[body.free_unknowns] = np.arange(len(body.free_unknowns))
+    return Compliance(body.solver, place[unknowns_of(nodes)].reshape(-1, 3), len(body.free_unknowns))
 
 
 def order(steps: list[float], errors: list[float]) -> Array:

@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.linalg import cholesky
 from scipy.optimize import nnls
-from shapes import box, ellipsoid
+from shapes import box, compliance_of, ellipsoid
 
 from poro.assembly import body_load
 from poro.compliance import Compliance
@@ -22,7 +22,7 @@ from poro.contact import (
 )
 from poro.levelset import LevelSet, level_set
 from poro.mesh.tetmesh import Array, TetMesh
-from poro.solid import Solid, solid, unknowns_of
+from poro.solid import Solid, solid
 from poro.tissue import GRAVITY_KPA_PER_MM, Tissue
 
 
@@ -30,12 +30,6 @@ def _floor(height: float) -> LevelSet:
     """Distance above the plane z = height; a cubic B-spline reproduces it exactly."""
     grid = np.broadcast_to((np.arange(60) * 5.0 - 100 - height)[None, None], (40, 40, 60)).copy()
     return LevelSet(grid, np.array([-100.0, -100.0, -100.0]), 5.0)
-
-
-def _compliance(body: Solid, nodes: Array) -> Compliance:
-    place = np.full(3 * len(body.mesh.points), -1)
-    place[body.free_unknowns] = np.arange(len(body.free_unknowns))
-    return Compliance(body.solver, place[unknowns_of(nodes)].reshape(-1, 3), len(body.free_unknowns))
 
 
 def _obstacle(mesh: TetMesh, level: LevelSet, nodes: Array) -> Obstacle:
@@ -51,7 +45,7 @@ def test_block_pressed_on_a_floor_carries_uniform_pressure() -> None:
     body = solid(mesh, tissue, top)
     imposed = np.broadcast_to([0, 0, -push], (len(top), 3)).copy()
     free = body.solve(np.zeros_like(mesh.points), imposed)
-    compliance = _compliance(body, bottom)
+    compliance = compliance_of(body, bottom)
     state = settle(compliance, _obstacle(mesh, _floor(0.0), bottom), free[bottom], 0.0)
     assert state.status is ContactStatus.SETTLED
     assert state.active.all()
@@ -71,7 +65,7 @@ def test_floor_out_of_reach_stays_untouched() -> None:
     top, bottom = (np.flatnonzero(mesh.points[:, 2] == z) for z in (20.0, 0.0))
     body = solid(mesh, Tissue(), top)
     free = body.solve(body_load(mesh, np.array([0, 0, -100 * GRAVITY_KPA_PER_MM])))
-    state = settle(_compliance(body, bottom), _obstacle(mesh, _floor(-5.0), bottom), free[bottom], 0.0)
+    state = settle(compliance_of(body, bottom), _obstacle(mesh, _floor(-5.0), bottom), free[bottom], 0.0)
     assert not state.active.any()
     assert_allclose(state.u, free[bottom])
     assert state.gap.min() == pytest.approx(5 + free[bottom, 2].min())
@@ -111,6 +105,49 @@ def test_active_set_equals_a_quadratic_program(seed: int) -> None:
     assert (force[~active] == 0).all()
 
 
+def _signorini(dense: Array, load: Array) -> tuple[Array, ContactStatus]:
+    """Forces (n,) of n one-way contacts of compliance dense (n, n) and free gaps `load` (n,), from none active."""
+    n = len(load)
+    full = np.kron(dense, np.diag([1.0, 0, 0])) + np.diag(np.tile([0, 1.0, 1.0], n))
+    none = Springs(np.zeros((0, n, 3)), np.zeros((0, n, 3)), np.zeros((0, 0)))
+    wall = Linearized(
+        _Dense(full), load, np.broadcast_to([1.0, 0, 0], (n, 3)).copy(), np.zeros((n, 3)), np.zeros((n, 3)), none
+    )
+    force, _, _, _, status = complementarity(wall, np.zeros(n, bool))
+    return force, status
+
+
+def _plain_sets(dense: Array, load: Array) -> bool:
+    """Whether the primal-dual active set without any safeguard comes to rest, instead of coming back to a set."""
+    active, seen = np.zeros(len(load), bool), set()
+    while active.tobytes() not in seen:
+        seen.add(active.tobytes())
+        force = np.zeros(len(load))
+        force[active] = -np.linalg.solve(dense[np.ix_(active, active)], load[active])
+        wrong = (active & (force < 0)) | (~active & (dense @ force + load < -1e-9))
+        if not wrong.any():
+            return True
+        active = active ^ wrong
+    return False
+
+
+def test_a_cycling_active_set_is_noticed_and_settled_by_pivots() -> None:
+    rng = np.random.default_rng(0)
+    cycled = 0
+    for _ in range(4000):
+        root = rng.normal(size=(8, rng.integers(1, 9)))
+        dense, load = root @ root.T + 10 ** rng.uniform(-3, -0.5) * np.eye(8), rng.normal(size=8)
+        if _plain_sets(dense, load):
+            continue
+        cycled += 1
+        force, status = _signorini(dense, load)
+        assert status is ContactStatus.PIVOTED
+        upper = cholesky(dense)
+        expected, _ = nnls(upper, -np.linalg.solve(upper.T, load))
+        assert_allclose(force, expected, atol=1e-6 * max(1, expected.max()))
+    assert cycled >= 5
+
+
 @pytest.fixture(scope="module")
 def hollow() -> tuple[TetMesh, Solid, Array, Obstacle, Compliance]:
     """A heavy ellipsoid hung by a few nodes inside its own outline."""
@@ -122,7 +159,7 @@ def hollow() -> tuple[TetMesh, Solid, Array, Obstacle, Compliance]:
     rest = mesh.points[nodes]
     moving = rest[:, 2] < -45
     obstacle = Obstacle(level, rest, moving, np.array([0, 0, 1.0]), np.minimum(level.evaluate(rest)[0], 0))
-    return mesh, body, nodes, obstacle, _compliance(body, nodes)
+    return mesh, body, nodes, obstacle, compliance_of(body, nodes)
 
 
 def test_level_set_derivatives() -> None:
