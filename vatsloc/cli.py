@@ -80,6 +80,33 @@ def evaluate(
 
 
 @app.command()
+def cohort(
+    folders: Annotated[
+        list[Path], typer.Argument(metavar="DIR...", help="Case folders, or folders that hold case folders.")
+    ],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for results and tables; a rerun goes on.")],
+    preset: Annotated[str, typer.Option(metavar="NAME", help="fast or balanced.")] = "balanced",
+    settings: Annotated[Path | None, typer.Option(metavar="FILE", help="TOML file that overrides the preset.")] = None,
+    jobs: Annotated[int, typer.Option(metavar="N", min=1, help="Cases run at once.")] = 1,
+    scheduler: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="Dask scheduler whose workers see the same files.")
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Localize and score many cases; one table of errors, gates, seconds and memory as CSV, Markdown and HTML."""
+    from vatsloc.study.cohort import as_json as cohort_json
+    from vatsloc.study.cohort import find_cases, run_cohort, table
+    from vatsloc.workflow.settings import load_settings
+
+    load_settings(preset, settings)
+    outcomes = run_cohort(find_cases(folders), out, preset, settings, jobs, scheduler, say=say)
+    if as_json:
+        show(cohort_json(outcomes))
+    else:
+        print(table(outcomes))
+
+
+@app.command()
 def phantom(
     name: Annotated[str | None, typer.Argument(metavar="NAME", help="Name of the phantom, for instance demo.")] = None,
     out: Annotated[Path | None, typer.Option("--out", metavar="CASE", help="Case folder to write.")] = None,

@@ -1,0 +1,133 @@
+"""Many cases run by a stand-in for the command line: tables by value, crashes that stop no other, and going on."""
+
+from __future__ import annotations
+
+import csv
+import os
+import sys
+from pathlib import Path
+
+import pytest
+
+from vatsloc.errors import CaseError
+from vatsloc.study.cohort import Outcome, as_json, find_cases, run_cohort, summary, table
+
+PROGRAM = """
+import json, os, signal, sys
+from pathlib import Path
+command, case, *rest = sys.argv[1:]
+name = Path(case).name
+with open(Path(__file__).with_name("calls"), "a") as calls:
+    calls.write(f"{command} {name}\\n")
+if command == "localize":
+    if name == "refused":
+        print("vatsloc: no lung in sight", file=sys.stderr)
+        sys.exit(3)
+    if name == "crash" and not Path(__file__).with_name("mended").exists():
+        os.kill(os.getpid(), signal.SIGKILL)
+    out = Path(rest[1])
+    out.mkdir(exist_ok=True)
+    gates = {"view": {"ok": True}, "fissures": {"ok": name != "gated"}}
+    (out / "run.json").write_text(json.dumps({"gates": gates, "threads": os.environ["NUMBA_NUM_THREADS"]}))
+    if name == "gated":
+        print("vatsloc: do not trust it", file=sys.stderr)
+        sys.exit(5)
+else:
+    if name == "bare":
+        print("vatsloc: no landmarks", file=sys.stderr)
+        sys.exit(2)
+    mm = {"good": 1.0, "gated": 15.0, "wrong": 12.0, "crash": 2.0}[name]
+    errors = {"mean": mm, "p95": 2 * mm, "max": 3 * mm}
+    scores = {"phase1": errors, "phase2": errors, "chain": errors}
+    scores |= {"nodule_deflated_mm": mm / 2, "nodule_in_ellipsoid95": mm < 5}
+    (Path(rest[0]) / "tre.json").write_text(json.dumps(scores))
+"""
+NAMES = ("good", "gated", "wrong", "crash", "refused", "bare")
+
+
+@pytest.fixture
+def cases(tmp_path: Path) -> list[Path]:
+    for name in NAMES:
+        (tmp_path / "cases" / name).mkdir(parents=True)
+        (tmp_path / "cases" / name / "case.toml").write_text("")
+    return [tmp_path / "cases" / name for name in NAMES]
+
+
+@pytest.fixture
+def program(tmp_path: Path) -> tuple[str, ...]:
+    path = tmp_path / "program.py"
+    path.write_text(PROGRAM)
+    return (sys.executable, str(path))
+
+
+def test_every_case_gets_its_line_although_one_crashes(
+    cases: list[Path], program: tuple[str, ...], tmp_path: Path
+) -> None:
+    outcomes = {o.name: o for o in run_cohort(cases, tmp_path / "out", jobs=3, program=program)}
+    assert [o.exit_code for o in outcomes.values()] == [0, 5, 0, -9, 3, 0]
+    assert [o.silent_failure for o in outcomes.values()] == [False, False, True, None, None, None]
+    assert outcomes["gated"].failed_gates == ["fissures"]
+    assert outcomes["refused"].says == "vatsloc: no lung in sight"
+    assert 5 < outcomes["good"].peak_mb < 500
+    with (tmp_path / "out" / "cohort.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["case"] for row in rows] == list(NAMES)
+    assert [rows[0][key] for key in ("chain_mean_mm", "phase1_p95_mm", "phase2_max_mm")] == ["1.0", "2.0", "3.0"]
+    page = (tmp_path / "out" / "cohort.html").read_text()
+    assert page.count("<tr class=") == len(NAMES)
+    assert '<tr class="silent">' in page
+    assert "http" not in page
+    lines = (tmp_path / "out" / "cohort.md").read_text().splitlines()
+    assert lines[2].startswith(
+        "| good | 0 | 1.00 / 2.00 / 3.00 | 1.00 / 2.00 / 3.00 | 1.00 / 2.00 / 3.00 | 0.50 | yes |"
+    )
+    assert "holds the nodule in 1 of 3 cases (1 of 2 under exit code 0)" in lines[-1]
+    assert lines[-1].endswith("Silent failures (nodule or mean landmark error over 10 mm under exit code 0): 1 of 3.")
+
+
+def test_a_rerun_takes_up_only_what_crashed_or_changed(
+    cases: list[Path], program: tuple[str, ...], tmp_path: Path
+) -> None:
+    run_cohort(cases, tmp_path / "out", jobs=3, program=program)
+    (tmp_path / "mended").touch()
+    (tmp_path / "calls").unlink()
+    os.utime(cases[0] / "case.toml", ns=(1, 1))
+    outcomes = run_cohort(cases, tmp_path / "out", program=program)
+    assert (tmp_path / "calls").read_text().split("\n")[:-1] == [
+        f"{command} {name}" for name in ("good", "crash") for command in ("localize", "evaluate")
+    ]
+    assert [o.exit_code for o in outcomes] == [0, 5, 0, 0, 3, 0]
+    run_cohort(cases[:1], tmp_path / "out", preset="fast", program=program)
+    assert (tmp_path / "calls").read_text().count("localize good") == 2
+
+
+def test_coverage_and_silent_failures_are_shares_of_what_can_be_told() -> None:
+    errors = {"mean": 9.0, "p95": 9.0, "max": 9.0}
+    scores = {"phase1": errors, "phase2": errors, "chain": errors, "nodule_in_ellipsoid95": False}
+    outcomes = [
+        Outcome("a", 0, 1.0, 1.0, "", [], 0, scores | {"nodule_deflated_mm": 10.1}, []),
+        Outcome("b", 0, 1.0, 1.0, "", [], 0, scores | {"nodule_deflated_mm": 9.9, "nodule_in_ellipsoid95": True}, []),
+        Outcome("c", 3, 1.0, 1.0, "a | b", [], None, None, []),
+    ]
+    assert as_json(outcomes)["coverage95"] == 0.5
+    assert as_json(outcomes)["silent_failure_share"] == 0.5
+    assert summary(outcomes).startswith("3 cases, 2 with exit code 0.")
+    assert "| a / b |" in table(outcomes)
+
+
+def test_cases_are_found_once_and_names_are_unique(cases: list[Path], tmp_path: Path) -> None:
+    assert find_cases([tmp_path / "cases", cases[0]]) == sorted(cases)
+    with pytest.raises(CaseError, match="holds no case"):
+        find_cases([cases[0], tmp_path])
+    (tmp_path / "more" / "good").mkdir(parents=True)
+    (tmp_path / "more" / "good" / "case.toml").touch()
+    with pytest.raises(CaseError, match="two cases are called good"):
+        find_cases([tmp_path / "cases", tmp_path / "more"])
+
+
+def test_a_scheduler_without_dask_is_refused(
+    cases: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(CaseError, match="--scheduler needs Dask"):
+        run_cohort(cases, tmp_path / "out", scheduler="tcp://nowhere:8786")
