@@ -152,6 +152,22 @@ def demo(
         raise GateFailed(f"The demo's quality gates failed: {', '.join(failed)}.")
 
 
+@app.command()
+def chart(
+    cases: Annotated[list[Path], typer.Argument(metavar="CASES...", help="Case folders with landmarks.")],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for runs.csv and the chart.")],
+    variants: Annotated[str | None, typer.Option(metavar="A,B,..", help="Variants to run; all by default.")] = None,
+) -> None:
+    """Errors against seconds of the method's variants over CASES; goes on where it was stopped (extra "report")."""
+    from vatsloc.study.chart import run_chart
+    from vatsloc.study.chart_draw import write_chart
+    from vatsloc.study.chart_variants import VARIANTS, chosen_variants
+
+    chosen = chosen_variants([name.strip() for name in variants.split(",")] if variants else None)
+    write_chart(run_chart(cases, chosen, out, say), VARIANTS, out)
+    print(out / "chart.html")
+
+
 @bench.command("poro")
 def bench_poro_command(
     max_tets: Annotated[int, typer.Option(metavar="N", help="Largest mesh of the cost table.")] = 500_000,

@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
-import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -16,13 +14,11 @@ import pytest
 
 from registration.rigid import RigidTransform
 from registration.volume import Volume
+from tests.vatsloc.browser import CHROMIUM, asked_by_the_page, visit
 from vatsloc.formats.meshes import Surface
 from vatsloc.report.data import Comparison, Landmark, Motion, Nodule, ReportData
 from vatsloc.report.render import write_report
 
-CHROMIUM = next(
-    (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
-)
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
 
 AFFINE = np.array([[2.0, 0, 0, -60], [0, 2, 0, -60], [0, 0, 2, -40], [0, 0, 0, 1]])
@@ -90,18 +86,6 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def visit(page: Path, folder: Path, fragment: str = "", size: str = "1280,800") -> tuple[str, str, str]:
-    """The document after its scripts ran, what the browser logged, and what it asked of the network."""
-    assert CHROMIUM is not None
-    log = folder / "net.json"
-    command = [CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run"]
-    command += ["--disable-background-networking", "--disable-component-update", "--disable-sync"]
-    command += ["--enable-logging=stderr", f"--user-data-dir={folder / 'profile'}", f"--log-net-log={log}"]
-    command += [f"--window-size={size}", "--virtual-time-budget=2000", "--dump-dom", f"{page.as_uri()}{fragment}"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
-    return done.stdout, done.stderr, log.read_text(encoding="utf-8")
-
-
 def probed(page: Path, folder: Path, fragment: str = "", size: str = "1280,800") -> dict[str, float]:
     """What the probe finds on the page."""
     copy = folder / "probed.html"
@@ -136,11 +120,6 @@ def test_a_request_would_have_been_refused_and_without_the_policy_seen(page: Pat
     assert not asked_by_the_page(network)
     spoiled.write_text(text.replace("Content-Security-Policy", "none"), encoding="utf-8")
     assert asked_by_the_page(visit(spoiled, tmp_path)[2])
-
-
-def asked_by_the_page(network: str) -> set[str]:
-    """Origins of requests in a network log but the browser's own."""
-    return set(re.findall(r'"initiator":"([^"]*)"', network)) - {"not an origin"}
 
 
 def test_every_viewer_draws(seen: dict[str, dict[str, float]]) -> None:

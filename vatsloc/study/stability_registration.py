@@ -16,13 +16,15 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from registration.ffd import FfdFit, FfdSettings, register_ffd
+from registration.ffd import FfdFit, FfdSettings
 from registration.field import PointMap
 from registration.rigid import RigidTransform
-from registration.sliding import BEYOND_MM, grown, masked, register_sliding
+from registration.sliding import register_sliding
 from registration.spine import register_spine
 from registration.volume import Array, Grid, Mask, Volume
+from vatsloc.study import chart_variants
 from vatsloc.study.stability_poro import markdown
+from vatsloc.workflow.pose import Register
 
 Row = dict[str, Any]
 SUCCESS_MM = 1.5
@@ -111,32 +113,22 @@ def make_pair(scene: Scene, seed: int) -> Pair:
 
 def plain(pair: Pair) -> FfdFit:
     """Free-form deformation of all that is seen."""
-    return register_ffd(pair.fixed, pair.moving, SETTINGS, fixed_mask=pair.seen, prior=pair.start)
+    return _registered(chart_variants.plain, pair)
 
 
 def masked_only(pair: Pair) -> FfdFit:
     """The paper's: both images masked outside their lungs, compared 5 mm beyond."""
-    region = grown(pair.fixed_lung, BEYOND_MM)
-    return register_ffd(
-        masked(pair.fixed, pair.fixed_lung),
-        masked(pair.moving, pair.moving_lung),
-        SETTINGS,
-        fixed_mask=Mask(region.inside & pair.seen.inside, region.ras_from_ijk),
-        prior=pair.start,
-    )
+    return _registered(chart_variants.masked_only, pair)
 
 
 def ours(pair: Pair) -> FfdFit:
     """`register_sliding`, which a run uses."""
-    return register_sliding(
-        pair.fixed,
-        pair.moving,
-        pair.moving_lung,
-        SETTINGS,
-        fixed_lung=pair.fixed_lung,
-        seen=pair.seen,
-        prior=pair.start,
-    )
+    return _registered(register_sliding, pair)
+
+
+def _registered(register: Register, pair: Pair) -> FfdFit:
+    given = {"fixed_lung": pair.fixed_lung, "seen": pair.seen, "prior": pair.start}
+    return register(pair.fixed, pair.moving, pair.moving_lung, SETTINGS, **given)
 
 
 METHODS: dict[str, Callable[[Pair], FfdFit]] = {"plain": plain, "masked": masked_only, "ours": ours}

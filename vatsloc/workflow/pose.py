@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,6 +30,8 @@ RIM_MM = 4.0
 """Nodes nearer than this to the rim of what the scanner saw are left to the extrapolation."""
 HINT_REACH_MM = 10.0
 """How far a marked vertebra may be off: less than half the distance to the next one."""
+Register = Callable[..., FfdFit]
+"""A registration that is called as `register_sliding` is."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +68,9 @@ class ChangeOfPose:
         return TetMesh(self.points_inf, self.mesh_ct.tets)
 
 
-def change_of_pose(case: Case, prepared: Prepared, settings: Settings, stages: Stages) -> ChangeOfPose:
+def change_of_pose(
+    case: Case, prepared: Prepared, settings: Settings, stages: Stages, register: Register = register_sliding
+) -> ChangeOfPose:
     """Register the CT to the inflated CBCT and continue the motion to the whole lung."""
     hinted = _hinted(case)
     with stages.stage("spine CT to inflated"):
@@ -92,7 +97,7 @@ def change_of_pose(case: Case, prepared: Prepared, settings: Settings, stages: S
         nowhere = np.zeros(len(mesh.points), dtype=bool)
         return ChangeOfPose(rigid, None, lung_inf, mesh, placed.points, nowhere, None, None, overlap)
     with stages.stage("free-form deformation"):
-        ffd = register_sliding(
+        ffd = register(
             prepared.inflated.volume,
             case.ct,
             prepared.lung_ct,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -96,9 +97,7 @@ PRESETS: dict[str, dict[str, Any]] = {
 
 def load_settings(preset: str, file: Path | None) -> Settings:
     """Values of a preset, overridden by those of a TOML file. Raises CaseError for unknown names and wrong values."""
-    if preset not in PRESETS:
-        raise CaseError(f'"{preset}" is no preset; choose one of {", ".join(PRESETS)}.')
-    values = PRESETS[preset]
+    values = _preset(preset)
     if file is not None:
         try:
             values = _merged(values, tomllib.loads(file.read_text(encoding="utf-8")))
@@ -106,17 +105,32 @@ def load_settings(preset: str, file: Path | None) -> Settings:
             raise CaseError(f"{file} is not there; give a TOML file of settings.") from error
         except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
             raise CaseError(f"{file} is not valid TOML ({error}); correct it.") from error
+    return _checked(values, str(file))
+
+
+def settings_of(preset: str, over: Mapping[str, Any]) -> Settings:
+    """Values of a preset, overridden by those of tables in memory. Raises CaseError as `load_settings`."""
+    return _checked(_merged(_preset(preset), over), "settings")
+
+
+def _preset(name: str) -> dict[str, Any]:
+    if name not in PRESETS:
+        raise CaseError(f'"{name}" is no preset; choose one of {", ".join(PRESETS)}.')
+    return PRESETS[name]
+
+
+def _checked(values: Mapping[str, Any], source: str) -> Settings:
     try:
         return Settings(**values)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         where = ".".join(str(part) for part in first["loc"])
-        raise CaseError(f"{file}: {where}: {first['msg']}; correct it.") from error
+        raise CaseError(f"{source}: {where}: {first['msg']}; correct it.") from error
 
 
-def _merged(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
+def _merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
     out = dict(base)
     for key, value in over.items():
         known = out.get(key)
-        out[key] = _merged(known, value) if isinstance(known, dict) and isinstance(value, dict) else value
+        out[key] = _merged(known, value) if isinstance(known, Mapping) and isinstance(value, Mapping) else value
     return out

@@ -1,0 +1,255 @@
+"""The chart: its points, its front, what it remembers between runs, and its variants of the registration."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from poro.fit import FitStatus
+from poro.mesh import TetMesh
+from registration.ffd import FfdSettings, Weights
+from registration.resample import resample
+from registration.rigid import RigidTransform
+from registration.volume import Mask, Volume
+from tests.vatsloc.browser import CHROMIUM, asked_by_the_page, visit
+from vatsloc.errors import CaseError, InputRefused
+from vatsloc.study import chart
+from vatsloc.study.affine import affine_to_points
+from vatsloc.study.chart import Row, append_row, measure_case, read_rows, run_chart
+from vatsloc.study.chart_draw import interactive, page, write_chart
+from vatsloc.study.chart_points import dominating, points_of, told_of_presets
+from vatsloc.study.chart_variants import VARIANTS, chosen_variants, masked_only, plain
+from vatsloc.workflow.stages import Stages
+
+ROWS = [
+    Row("rigid", "a", 10, 16, 4, 17, 25, 2, 25, 35, 6, 30, 1),
+    Row("rigid", "b", 6, 12, 6, 15, 21, 2, 21, 31, 8, 20, 1),
+    Row("fast", "a", 0.5, 1.0, 10, 0.9, 2.0, 12, 1.0, 2.5, 22, 0.6, 1),
+    Row("fast", "b", 0.3, 0.6, 12, 0.7, 1.6, 14, 0.8, 1.9, 26, 0.4, 1),
+    Row("balanced", "a", 0.6, 0.9, 20, 0.5, 1.5, 30, 0.6, 1.4, 50, 0.3, 1),
+    Row("balanced", "b", 0.4, 0.5, 20, 0.5, 1.5, 30, 0.6, 1.4, 50, 0.3, 1),
+    Row("alone", "a", 0.6, 0.9, 20, 2.0, 4.0, 10, 2.1, 4.4, 30, 2.0, 1),
+    Row("alone", "b", failed="the contact did not settle"),
+]
+
+
+def test_points_average_errors_over_cases_and_take_the_median_of_seconds() -> None:
+    points = {(p.phase, p.variant): p for p in points_of(ROWS, VARIANTS)}
+    rigid = points["chain", "rigid"]
+    assert (rigid.mean, rigid.p95, rigid.seconds, rigid.n, rigid.complete) == (23, 33, 7, 2, True)
+    assert (points["chain", "alone"].n, points["chain", "alone"].complete) == (1, False)
+    assert ("phase1", "alone") not in points  # its change of pose is that of balanced
+    only_b = {(p.phase, p.variant): p for p in points_of(ROWS, VARIANTS, "b")}
+    assert only_b["phase1", "fast"].mean == 0.3
+
+
+def test_the_front_holds_what_nothing_beats_in_both() -> None:
+    points = {(p.phase, p.variant): p for p in points_of(ROWS, VARIANTS)}
+    assert points["phase1", "fast"].front == ("mean", "p95")
+    assert points["phase1", "balanced"].front == ("p95",)
+    assert points["phase1", "rigid"].front == ("mean", "p95")
+    # "alone" is faster than balanced in phase 2, but a case is missing: it neither leads nor beats.
+    assert points["phase2", "alone"].front == ()
+    assert points["phase2", "fast"].front == ("mean", "p95")
+    panel = [p for (phase, _), p in points.items() if phase == "phase1"]
+    beaten = dominating(points["phase1", "balanced"], panel, "mean")
+    assert beaten is not None
+    assert beaten.variant == "fast"
+
+
+def test_a_word_on_every_preset_names_what_beats_it() -> None:
+    told = told_of_presets(points_of(ROWS, VARIANTS))
+    assert (
+        "balanced, Phase 1: CT to inflated: not on the front of the mean: fast has 0.40 mm in 11 s, it 0.50 mm in 20 s."
+        in told
+    )
+    assert "fast, Whole chain: CT to deflated: on the front of the mean (0.90 mm in 24 s)." in told
+    assert len(told) == 2 * 3 * 2
+
+
+def test_rows_survive_the_file_and_a_stranger_s_table_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "runs.csv"
+    assert read_rows(path) == []
+    for row in ROWS:
+        append_row(path, row)
+    back = read_rows(path)
+    assert back[:-1] == ROWS[:-1]
+    assert back[-1].failed == "the contact did not settle"
+    assert math.isnan(back[-1].chain_mean)
+    path.write_text(path.read_text() + "fast,c,not a number\n")
+    with pytest.raises(InputRefused, match="damaged line"):
+        read_rows(path)
+    path.write_text("variant,case\n")
+    with pytest.raises(InputRefused, match="not a table of this version"):
+        read_rows(path)
+
+
+def test_pairs_that_are_there_are_not_run_again(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    ran: list[tuple[str, str]] = []
+
+    def measured(folder: Path, variants: Mapping[str, Any]) -> Iterator[Row]:
+        for name in variants:
+            ran.append((folder.name, name))
+            yield Row(name, folder.name, 1.0)
+
+    monkeypatch.setattr(chart, "measure_case", measured)
+    monkeypatch.setattr(chart, "warm_up", lambda folder: ran.append((folder.name, "warm")))
+    cases = [tmp_path / "a", tmp_path / "b"]
+    some = chosen_variants(["fast", "balanced"])
+    assert len(run_chart(cases[:1], some, tmp_path)) == 2
+    rows = run_chart(cases, chosen_variants(["balanced", "rigid"]), tmp_path)
+    assert ran[:3] == [("a", "warm"), ("a", "fast"), ("a", "balanced")]
+    assert ran[3:] == [("a", "warm"), ("a", "rigid"), ("b", "balanced"), ("b", "rigid")]
+    assert [(row.case, row.variant) for row in rows][-2:] == [("b", "balanced"), ("b", "rigid")]
+    run_chart(cases, chosen_variants(["balanced", "rigid"]), tmp_path)
+    assert len(ran) == 7
+
+
+MESH = TetMesh(60.0 * np.vstack([np.zeros(3), np.eye(3)]) - 10, np.array([[0, 1, 2, 3]]))
+CT = np.array([[2.0, 3.0, 4.0], [5.0, 1.0, 8.0]])
+MOVED = np.array([1.0, 2, 0])
+
+
+def test_a_case_s_rows_hold_the_errors_and_the_seconds_of_what_each_variant_needs(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """The truth moves by (1, 0, 0) and then by (0, 2, 0); both phases find half of it."""
+
+    def took(stages: Stages, **seconds: float) -> None:
+        stages.seconds |= {name.replace("_", " "): s for name, s in seconds.items()}
+
+    def read(stages: Stages) -> Any:
+        took(stages, read=1.0, lungs=2.0)
+        return SimpleNamespace()
+
+    def pose(_case: Any, _prepared: Any, settings: Any, stages: Stages, _register: Any) -> Any:
+        took(stages, spine_CT_to_inflated=0.5, rest=3.5)
+        shift = np.array([0.5, 0, 0]) if settings.registration.on else np.zeros(3)
+        return SimpleNamespace(
+            inf_from_ct_rigid=RigidTransform.identity(),
+            inf_from_ct=lambda points: points + shift,
+            mesh_inf=MESH,
+            mesh_ct=MESH,
+        )
+
+    def collapse(_case: Any, _prepared: Any, _pose: Any, settings: Any, stages: Stages) -> Any:
+        took(stages, spine_inflated_to_deflated=0.25, fit=7.75)
+        if not settings.model.hilum:
+            return SimpleNamespace(fit=SimpleNamespace(status=FitStatus.CONTACT))
+        return SimpleNamespace(
+            fit=SimpleNamespace(status=FitStatus.CONVERGED),
+            def_from_inf_rigid=RigidTransform.identity(),
+            mesh_after=TetMesh(MESH.points + np.array([0, 1.0, 0]), MESH.tets),
+        )
+
+    nodule = SimpleNamespace(centre_ras=CT[0])
+    landmarks = SimpleNamespace(ct=CT, inflated=CT + np.eye(3)[0], deflated=CT + MOVED)
+    truth = SimpleNamespace(landmarks=landmarks, nodule=SimpleNamespace(nodule_deflated_ras=CT[0] + MOVED))
+    monkeypatch.setattr(chart, "read_case", lambda _folder: SimpleNamespace(nodule=nodule))
+    monkeypatch.setattr(chart, "read_truth", lambda _folder: truth)
+    monkeypatch.setattr(chart, "prepare", lambda _case, stages: read(stages))
+    monkeypatch.setattr(chart, "change_of_pose", pose)
+    monkeypatch.setattr(chart, "pneumothorax", collapse)
+    names = ["rigid", "ffd-8", "balanced", "no-hilum"]
+    rows = {row.variant: row for row in measure_case(tmp_path / "case", chosen_variants(names))}
+    rigid, pose_only, balanced, failed = (rows[name] for name in names)
+    assert (rigid.phase1_mean, rigid.phase2_mean) == (1, 2)
+    assert rigid.chain_mean == pytest.approx(math.sqrt(5))
+    assert (rigid.phase1_seconds, rigid.phase2_seconds) == (pytest.approx(3.5, abs=0.1), 0.25)
+    assert (pose_only.phase1_mean, pose_only.phase1_seconds) == (0.5, pytest.approx(7.0, abs=0.1))
+    assert math.isnan(pose_only.chain_mean)
+    assert (balanced.phase1_mean, balanced.phase2_mean, balanced.phase2_seconds) == (0.5, 1, 8)
+    assert balanced.chain_mean == pytest.approx(math.hypot(1, 1))
+    assert balanced.nodule_mm == pytest.approx(math.hypot(0.5, 1))
+    assert balanced.chain_seconds == pytest.approx(15, abs=0.1)
+    assert failed.failed == "the contact of the collapsing lung did not settle"
+
+
+def test_every_variant_s_settings_are_valid_and_unknown_names_are_refused() -> None:
+    assert VARIANTS["tetrahedra-5"].settings.mesh.model_edge_mm == 5
+    assert not VARIANTS["paper-cost-alone"].settings.residual.on
+    assert VARIANTS["fast"].settings.registration.grid_mm == 20
+    for variant in VARIANTS.values():
+        assert variant.settings.gates.min_overlap == 0.4
+    with pytest.raises(CaseError, match="slow: no such variant; choose from rigid, affine"):
+        chosen_variants(["rigid", "slow"])
+    assert list(chosen_variants(None)) == list(VARIANTS)
+
+
+def pair(mapped: Any) -> tuple[Volume, Volume, Mask]:
+    """fixed(x) = moving(mapped(x)), balls in a box, and a mask of all of it."""
+    affine = np.diag([4.0, 4, 4, 1])
+    grid = Volume(np.zeros((30, 30, 30), dtype=np.float32), affine).grid
+    hu = np.full(grid.shape, -800.0)
+    for centre in np.random.default_rng(2).uniform(10, 106, (60, 3)):
+        hu += 700 * np.exp(-np.sum((grid.points() - centre) ** 2, axis=-1) / 72)
+    moving = Volume(hu.astype(np.float32), affine)
+    return resample(moving, grid, mapped), moving, Mask(np.ones(grid.shape, dtype=bool), affine)
+
+
+def given(mask: Mask) -> dict[str, Any]:
+    return {"fixed_lung": mask, "seen": mask, "prior": RigidTransform.identity()}
+
+
+def test_the_stiff_free_form_of_the_variant_affine_is_an_affine_map() -> None:
+    matrix = np.array([[1.04, 0.02, 0], [0, 0.97, 0.01], [-0.02, 0, 1.02]])
+    fixed, moving, mask = pair(lambda x: (x - 60) @ matrix.T + 60 + [2, -1, 3])
+    stiff = VARIANTS["affine"].settings.registration
+    settings = FfdSettings(stiff.grid_mm, stiff.levels, 4.0, None, weights=Weights(bending=stiff.bending))
+    found = plain(fixed, moving, mask, settings, **given(mask)).moving_from_fixed
+    points = np.random.default_rng(3).uniform(20, 96, (200, 3))
+    affine = affine_to_points(points, found(points))
+    assert np.abs(affine(points) - found(points)).max() < 0.05
+    truth = (points - 60) @ matrix.T + 60 + np.array([2, -1, 3])
+    assert np.linalg.norm(truth - points, axis=1).mean() > 3
+    assert np.linalg.norm(found(points) - truth, axis=1).mean() < 0.5  # an eighth of a voxel
+
+
+@pytest.mark.parametrize("register", [plain, masked_only])
+def test_variants_of_the_registration_find_a_shift_by_value_and_sign(register: Any) -> None:
+    shift = np.array([4.0, -3, 2])
+    fixed, moving, seen = pair(lambda x: x + shift)
+    points, affine = fixed.grid.points(), fixed.ras_from_ijk
+    fixed_lung = Mask(np.linalg.norm(points + shift - 60, axis=-1) < 40, affine)
+    moving_lung = Mask(np.linalg.norm(points - 60, axis=-1) < 40, affine)
+    asked = given(fixed_lung) | {"seen": seen}
+    fit = register(fixed, moving, moving_lung, FfdSettings(32.0, 2, 4.0, None), **asked)
+    middle = np.array([[60.0, 60, 60]])
+    np.testing.assert_allclose(fit.moving_from_fixed(middle) - middle, [shift], atol=0.3)
+
+
+def test_the_chart_s_files_hold_its_numbers(tmp_path: Path) -> None:
+    write_chart(ROWS, VARIANTS, tmp_path)
+    table = (tmp_path / "chart.csv").read_text().splitlines()
+    assert 'chain,rigid,"spine alone, in both phases",23,33,7,2,mean p95' in table
+    svg = (tmp_path / "chart.svg").read_text()
+    assert svg.startswith("<?xml")
+    assert (tmp_path / "chart.png").stat().st_size > 20_000
+    text = page(ROWS, points_of(ROWS, VARIANTS))
+    assert "| fast | preset fast | 0.90 | 2.20 | 24.0 | 2 | mean, 95 % |" in text
+    assert "- alone on b: the contact did not settle" in text
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+def test_the_page_draws_every_point_and_asks_nothing_of_the_network(tmp_path: Path) -> None:
+    html = tmp_path / "chart.html"
+    rows = [*ROWS, replace(ROWS[0], variant="</script>", case="a")]
+    html.write_text(interactive(rows, VARIANTS), encoding="utf-8")
+    document, logged, network = visit(html, tmp_path)
+    assert "CONSOLE" not in logged
+    assert not asked_by_the_page(network)
+    drawn = re.findall(r'data-variant="([^"]*)"', document)
+    assert sorted(drawn) == sorted(p.variant for p in points_of(rows, VARIANTS))
+    assert document.count('stroke="#009E73"') == 2 + 5  # the paper's errors, phase 1 and chain
+    shown = re.search(r'<script type="application/json" id="data">(.*?)</script>', html.read_text(), re.DOTALL)
+    assert shown is not None
+    assert set(json.loads(shown[1])["sets"]) == {"all cases", "a", "b"}
