@@ -24,6 +24,8 @@ from poro.model import (
 from poro.observations import Observer, Residuals, Target, independence
 
 CHI2_95_3D = 7.814728  # 95 % quantile of chi-squared with three degrees of freedom
+# Longest step in (log10 kappa_b, phi, d_diaph_mm): beyond it the contact seen from here says nothing.
+REACH = np.array([1.0, 0.2, 8.0])
 
 
 @dataclass(frozen=True)
@@ -204,7 +206,9 @@ def _descend(problem: _Problem, theta: Array) -> tuple[Array, PoroState, tuple[F
     history = [FitStep(cost, damping, theta, True)]
     normal, slope = _normal_equations(problem, rows, whitening, sensitivity(problem.system, state), theta)
     for _ in range(problem.settings.max_steps):
-        step = _bounded_step(normal, slope, damping, theta, low, high, free)
+        reach = np.concatenate([REACH, np.full(len(theta) - 3, np.inf)])
+        near = np.maximum(low, theta - reach), np.minimum(high, theta + reach)
+        step = _bounded_step(normal, slope, damping, theta, *near, free)
         if not step.any():
             return theta, state, tuple(history), True
         trial_state = solve(problem.system, Theta.of(theta + step), state)

@@ -7,8 +7,9 @@ import pytest
 from numpy.testing import assert_allclose
 from shapes import ellipsoid
 
-from poro.fit import Fit, FitSettings, FitStatus, ellipsoid95, fit
+from poro.fit import REACH, Fit, FitSettings, FitStatus, ellipsoid95, fit
 from poro.mesh import interpolate, locate
+from poro.mesh.tetmesh import Array
 from poro.model import PoroState, PoroStatus, PoroSystem, Theta, assemble, sensitivity, solve
 from poro.modes import hilum_modes, shape_modes, shrinkage_modes
 from poro.observations import Observer, Target
@@ -96,6 +97,22 @@ def test_own_target_is_recovered(recovered: Fit, truth: PoroState) -> None:
     assert np.linalg.norm(recovered.state.u - truth.u, axis=1).max() < 0.1
     cost = [step.cost for step in recovered.history]
     assert (np.diff(cost) <= 0).all()
+
+
+def test_no_trial_reaches_farther_than_contact_can_follow(system: PoroSystem, truth: PoroState) -> None:
+    """The travel is all but unseen by the inner points, so an unbounded step would leap to the box's wall."""
+    target = _target(system, truth, inner=15)
+    unseen = Target(target.points[:0], target.normals[:0], target.weights[:0], *_inner(target))
+    history = fit(system, unseen, FitSettings(starts=((1e-9, 0.7, 0.0),))).history
+    last = history[0].theta
+    for step in history[1:]:
+        assert (np.abs(step.theta - last) <= REACH + 1e-12).all()
+        last = step.theta if step.accepted else last
+    assert max(abs(step.theta[0] - history[0].theta[0]) for step in history) > REACH[0]
+
+
+def _inner(target: Target) -> tuple[Array, Array, Array]:
+    return target.inflated, target.deflated, target.keypoint_weights
 
 
 def test_ellipsoid_grows_with_what_is_unknown(recovered: Fit, system: PoroSystem) -> None:
