@@ -37,7 +37,7 @@ RIGID_INFLATED_FROM_CT = "from-CT_to-CBCTinflated_mode-points_desc-rigid_xfm.tfm
 RIGID_CT_FROM_INFLATED = "from-CBCTinflated_to-CT_mode-image_desc-rigid_xfm.tfm"
 RIGID_DEFLATED_FROM_INFLATED = "from-CBCTinflated_to-CBCTdeflated_mode-points_desc-rigid_xfm.tfm"
 RIGID_INFLATED_FROM_DEFLATED = "from-CBCTdeflated_to-CBCTinflated_mode-image_desc-rigid_xfm.tfm"
-REPORT = "report.html"
+REPORT, SCENE = "report.html", "scene.mrml"
 
 OUTPUT_FILES = (
     NODULE_INFLATED,
@@ -60,8 +60,9 @@ OUTPUT_FILES = (
     RIGID_INFLATED_FROM_DEFLATED,
     RUN_FILE,
     REPORT,
+    SCENE,
 )
-"""What a finished results folder holds; the report is written by its own module into the same folder."""
+"""What a finished results folder holds; report and scene are written by modules of their own into the same folder."""
 
 
 @dataclass(frozen=True)
@@ -121,7 +122,7 @@ class ResultData:
 
 
 def write_results(folder: Path, data: ResultData) -> None:
-    """Write every output file but the report into an existing folder, two files at a time."""
+    """Write every output file but report and scene into an existing folder, two files at a time."""
     axes = data.stored_axes
     inflated, deflated = axes["cbct_inflated"], axes["cbct_deflated"]
     writes: list[Callable[[], None]] = [

@@ -22,7 +22,8 @@ from vatsloc.maps import covered, sampled
 from vatsloc.report.collect import report_data
 from vatsloc.report.data import LUNG, SURFACE, Outline, Picture
 from vatsloc.report.render import write_report
-from vatsloc.results import OUTPUT_FILES, REPORT, ResultData, RunRecord, write_results
+from vatsloc.results import OUTPUT_FILES, REPORT, SCENE, ResultData, RunRecord, write_results
+from vatsloc.scene import write_result_scene
 from vatsloc.workflow.localize import Localization, localize, surface_distances
 from vatsloc.workflow.pneumothorax import contact_surface
 from vatsloc.workflow.pose import ChangeOfPose
@@ -54,6 +55,7 @@ def run_case(folder: Path, out: Path, settings: Settings, say: Say = quiet) -> d
         with stages.stage("write"):
             result = _result(case, found, fields, _record(case, found, settings, stages))
             write_results(partial, result)
+            write_result_scene(partial / SCENE, folder, out, result)
         with stages.stage("report"):
             write_report(partial / REPORT, report_data(case, result, _pictures(case, found)))
     return result.run.as_json()
