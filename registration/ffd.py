@@ -44,7 +44,8 @@ class FfdSettings:
     spacing_mm: finest control spacing; levels: each coarser one doubles it; voxel_mm: finest image voxels;
     window_mm: edge of the local correlation's window, None for one correlation over all samples;
     noise_hu: standard deviation below which a window counts as noise; mass_preserving: lung HU follows the volume;
-    weights: see `Weights`; steps: Gauss-Newton steps per level at most.
+    weights: see `Weights`; steps: Gauss-Newton steps per level at most; metric: another dissimilarity than these
+    correlations, made from the samples of a level.
     """
 
     spacing_mm: float = 16.0
@@ -55,6 +56,7 @@ class FfdSettings:
     mass_preserving: bool = False
     weights: Weights = field(default_factory=Weights)
     steps: int = 30
+    metric: Callable[[Images], Metric] | None = None
 
 
 @dataclass(frozen=True)
@@ -176,7 +178,9 @@ def _level(setting: _Setting, images: Images, spline: BSplineField) -> tuple[BSp
 
 
 def chosen_metric(images: Images, settings: FfdSettings) -> Metric:
-    """The correlation that the settings ask for, on the samples of one level."""
+    """The dissimilarity that the settings ask for, on the samples of one level."""
+    if settings.metric is not None:
+        return settings.metric(images)
     if settings.window_mm is None:
         return GlobalNcc(images.fixed)
     grid = images.samples.grid
