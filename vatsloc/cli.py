@@ -6,7 +6,7 @@ import json
 import os
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -157,6 +157,9 @@ def chart(
     cases: Annotated[list[Path], typer.Argument(metavar="CASES...", help="Case folders with landmarks.")],
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for runs.csv and the chart.")],
     variants: Annotated[str | None, typer.Option(metavar="A,B,..", help="Variants to run; all by default.")] = None,
+    clock: Annotated[
+        Literal["seconds", "cpu"], typer.Option(help="What is drawn: the clock's seconds or the processors'.")
+    ] = "seconds",
 ) -> None:
     """Errors against seconds of the method's variants over CASES; goes on where it was stopped (extra "report")."""
     from vatsloc.study.chart import run_chart
@@ -164,7 +167,7 @@ def chart(
     from vatsloc.study.chart_variants import VARIANTS, chosen_variants
 
     chosen = chosen_variants([name.strip() for name in variants.split(",")] if variants else None)
-    write_chart(run_chart(cases, chosen, out, say), VARIANTS, out)
+    write_chart(run_chart(cases, chosen, out, say), VARIANTS, out, clock)
     print(out / "chart.html")
 
 

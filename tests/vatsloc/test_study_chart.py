@@ -30,14 +30,23 @@ from vatsloc.study.chart_points import dominating, points_of, told_of_presets
 from vatsloc.study.chart_variants import VARIANTS, chosen_variants, masked_only, plain
 from vatsloc.workflow.stages import Stages
 
+
+def row(variant: str, case: str, *numbers: float) -> Row:
+    """Mean, 95 % and seconds of every phase, then the nodule; processors take twice as long."""
+    names = [f"{phase}_{what}" for phase in ("phase1", "phase2", "chain") for what in ("mean", "p95", "seconds")]
+    named: dict[str, Any] = dict(zip(names, numbers, strict=False))
+    cpu: dict[str, Any] = {f"{p}_cpu": 2 * named[f"{p}_seconds"] for p in ("phase1", "phase2", "chain")}
+    return Row(variant, case, nodule_mm=numbers[9], load=1, **named, **cpu)
+
+
 ROWS = [
-    Row("rigid", "a", 10, 16, 4, 17, 25, 2, 25, 35, 6, 30, 1),
-    Row("rigid", "b", 6, 12, 6, 15, 21, 2, 21, 31, 8, 20, 1),
-    Row("fast", "a", 0.5, 1.0, 10, 0.9, 2.0, 12, 1.0, 2.5, 22, 0.6, 1),
-    Row("fast", "b", 0.3, 0.6, 12, 0.7, 1.6, 14, 0.8, 1.9, 26, 0.4, 1),
-    Row("balanced", "a", 0.6, 0.9, 20, 0.5, 1.5, 30, 0.6, 1.4, 50, 0.3, 1),
-    Row("balanced", "b", 0.4, 0.5, 20, 0.5, 1.5, 30, 0.6, 1.4, 50, 0.3, 1),
-    Row("alone", "a", 0.6, 0.9, 20, 2.0, 4.0, 10, 2.1, 4.4, 30, 2.0, 1),
+    row("rigid", "a", 10, 16, 4, 17, 25, 2, 25, 35, 6, 30),
+    row("rigid", "b", 6, 12, 6, 15, 21, 2, 21, 31, 8, 20),
+    row("fast", "a", 0.5, 1.0, 10, 0.9, 2.0, 12, 1.0, 2.5, 22, 0.6),
+    row("fast", "b", 0.3, 0.6, 12, 0.7, 1.6, 14, 0.8, 1.9, 26, 0.4),
+    row("balanced", "a", 0.6, 0.9, 20, 0.5, 1.5, 30, 0.6, 1.4, 50, 0.3),
+    row("balanced", "b", 0.4, 0.5, 20, 0.5, 1.5, 30, 0.6, 1.4, 50, 0.3),
+    row("alone", "a", 0.6, 0.9, 20, 2.0, 4.0, 10, 2.1, 4.4, 30, 2.0),
     Row("alone", "b", failed="the contact did not settle"),
 ]
 
@@ -48,8 +57,10 @@ def test_points_average_errors_over_cases_and_take_the_median_of_seconds() -> No
     assert (rigid.mean, rigid.p95, rigid.seconds, rigid.n, rigid.complete) == (23, 33, 7, 2, True)
     assert (points["chain", "alone"].n, points["chain", "alone"].complete) == (1, False)
     assert ("phase1", "alone") not in points  # its change of pose is that of balanced
-    only_b = {(p.phase, p.variant): p for p in points_of(ROWS, VARIANTS, "b")}
+    only_b = {(p.phase, p.variant): p for p in points_of(ROWS, VARIANTS, case="b")}
     assert only_b["phase1", "fast"].mean == 0.3
+    by_cpu = {(p.phase, p.variant): p for p in points_of(ROWS, VARIANTS, "cpu")}
+    assert by_cpu["chain", "rigid"].seconds == 14
 
 
 def test_the_front_holds_what_nothing_beats_in_both() -> None:
@@ -126,6 +137,7 @@ def test_a_case_s_rows_hold_the_errors_and_the_seconds_of_what_each_variant_need
 
     def took(stages: Stages, **seconds: float) -> None:
         stages.seconds |= {name.replace("_", " "): s for name, s in seconds.items()}
+        stages.cpu_seconds |= {name: 10 * s for name, s in stages.seconds.items()}
 
     def read(stages: Stages) -> Any:
         took(stages, read=1.0, lungs=2.0)
@@ -171,6 +183,7 @@ def test_a_case_s_rows_hold_the_errors_and_the_seconds_of_what_each_variant_need
     assert balanced.chain_mean == pytest.approx(math.hypot(1, 1))
     assert balanced.nodule_mm == pytest.approx(math.hypot(0.5, 1))
     assert balanced.chain_seconds == pytest.approx(15, abs=0.1)
+    assert (rigid.phase2_cpu, balanced.phase2_cpu) == (2.5, 80)
     assert failed.failed == "the contact of the collapsing lung did not settle"
 
 

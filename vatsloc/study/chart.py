@@ -36,20 +36,24 @@ NAN = float("nan")
 @dataclass(frozen=True)
 class Row:
     """One variant on one case. *_mean, *_p95: target registration errors, mm; *_seconds: of what the phase needs, the
-    chain's from the images on disk to the nodule's place; load: processes that ran on the machine at its end; failed:
-    why there is no number."""
+    chain's from the images on disk to the nodule's place; *_cpu: the same as processor seconds, which other programs
+    disturb less; load: processes that ran on the machine at its end; failed: why there is no number.
+    """
 
     variant: str
     case: str
     phase1_mean: float = NAN
     phase1_p95: float = NAN
     phase1_seconds: float = NAN
+    phase1_cpu: float = NAN
     phase2_mean: float = NAN
     phase2_p95: float = NAN
     phase2_seconds: float = NAN
+    phase2_cpu: float = NAN
     chain_mean: float = NAN
     chain_p95: float = NAN
     chain_seconds: float = NAN
+    chain_cpu: float = NAN
     nodule_mm: float = NAN
     load: float = NAN
     failed: str = ""
@@ -85,6 +89,27 @@ def warm_up(folder: Path) -> None:
     pneumothorax(case, prepared, change_of_pose(case, prepared, settings, stages), settings, stages)
 
 
+@dataclass(frozen=True)
+class _Cost:
+    """What stages took: seconds by the clock and of the processors."""
+
+    seconds: float
+    cpu: float
+
+    @staticmethod
+    def of(stages: Stages, *names: str) -> _Cost:
+        """Of the named stages, of all without names."""
+        chosen = names or tuple(stages.seconds)
+        return _Cost(sum(stages.seconds[n] for n in chosen), sum(stages.cpu_seconds[n] for n in chosen))
+
+    def __add__(self, other: _Cost) -> _Cost:
+        return _Cost(self.seconds + other.seconds, self.cpu + other.cpu)
+
+    def named(self, phase: str) -> dict[str, Any]:
+        """Columns of a row."""
+        return {f"{phase}_seconds": self.seconds, f"{phase}_cpu": self.cpu}
+
+
 @dataclass
 class _CaseRuns:
     """A case whose images are read and prepared once; what that took counts for every variant."""
@@ -92,17 +117,17 @@ class _CaseRuns:
     case: Case
     truth: Truth
     prepared: Prepared
-    seconds: float
-    poses: dict[str, tuple[ChangeOfPose, float]] = field(default_factory=dict)
+    cost: _Cost
+    poses: dict[str, tuple[ChangeOfPose, _Cost]] = field(default_factory=dict)
 
-    def pose(self, variant: Variant) -> tuple[ChangeOfPose, float]:
-        """Phase 1 and its seconds; the same one is not run again."""
+    def pose(self, variant: Variant) -> tuple[ChangeOfPose, _Cost]:
+        """Phase 1 and its cost; the same one is not run again."""
         settings = variant.settings
         key = f"{variant.register.__name__} {settings.registration} {settings.mesh.edge_mm}"
         if key not in self.poses:
             stages = Stages()
             found = change_of_pose(self.case, self.prepared, settings, stages, variant.register)
-            self.poses[key] = found, sum(stages.seconds.values())
+            self.poses[key] = found, _Cost.of(stages)
         return self.poses[key]
 
 
@@ -112,7 +137,7 @@ def measure_case(folder: Path, variants: Mapping[str, Variant]) -> Iterator[Row]
     with stages.stage("read"):
         case = read_case(folder)
     prepared = prepare(case, stages)
-    runs = _CaseRuns(case, read_truth(folder), prepared, sum(stages.seconds.values()))
+    runs = _CaseRuns(case, read_truth(folder), prepared, _Cost.of(stages))
     for name, variant in variants.items():
         row = Row(name, folder.resolve().name)
         try:
@@ -123,12 +148,12 @@ def measure_case(folder: Path, variants: Mapping[str, Variant]) -> Iterator[Row]
 
 
 def _run(runs: _CaseRuns, variant: Variant, row: Row) -> Row:
-    pose, pose_seconds = runs.pose(variant)
-    phase1_seconds = runs.seconds + pose_seconds
+    pose, pose_cost = runs.pose(variant)
+    phase1 = runs.cost + pose_cost
     rigid = pose.inf_from_ct_rigid
     if variant.scored is Scored.POSE:
         maps = RunMaps(rigid, rigid, rigid, pose.inf_from_ct, rigid, rigid)
-        return replace(_scored(runs.truth, maps, row, ("phase1",)), phase1_seconds=phase1_seconds)
+        return replace(_scored(runs.truth, maps, row, ("phase1",)), **phase1.named("phase1"))
     stages = Stages()
     collapse = pneumothorax(runs.case, runs.prepared, pose, variant.settings, stages)
     if collapse.fit.status is FitStatus.CONTACT:
@@ -143,14 +168,8 @@ def _run(runs: _CaseRuns, variant: Variant, row: Row) -> Row:
         def_from_inf=MeshMap(pose.mesh_inf, after, def_from_inf),
         def_from_ct=MeshMap(pose.mesh_ct, after, def_from_inf @ rigid),
     )
-    phase2_seconds = sum(stages.seconds.values())
-    row = replace(
-        row,
-        phase1_seconds=phase1_seconds,
-        phase2_seconds=phase2_seconds,
-        chain_seconds=phase1_seconds + phase2_seconds,
-        nodule_mm=_off(maps.def_from_inf(pose.inf_from_ct(runs.case.nodule.centre_ras[None])), runs.truth),
-    )
+    nodule = maps.def_from_inf(pose.inf_from_ct(runs.case.nodule.centre_ras[None]))
+    row = _spent(replace(row, nodule_mm=_off(nodule, runs.truth)), phase1, _Cost.of(stages))
     return _scored(runs.truth, maps, row, PHASES)
 
 
@@ -159,19 +178,13 @@ def _spines(runs: _CaseRuns, variant: Variant, row: Row) -> Row:
     stages = Stages()
     pose = change_of_pose(runs.case, runs.prepared, variant.settings, stages, variant.register)
     rigid = pose.inf_from_ct_rigid
-    seconds = stages.seconds[SPINES["phase1"]]
     collapse = pneumothorax(runs.case, runs.prepared, pose, variant.settings, stages)
-    back = stages.seconds[SPINES["phase2"]]
+    there, back = (_Cost.of(stages, SPINES[phase]) for phase in ("phase1", "phase2"))
     def_from_inf: RigidTransform = collapse.def_from_inf_rigid
     chain = def_from_inf @ rigid
     maps = RunMaps(rigid, chain, def_from_inf, rigid, def_from_inf, chain)
-    row = replace(
-        row,
-        phase1_seconds=runs.seconds + seconds,
-        phase2_seconds=back,
-        chain_seconds=runs.seconds + seconds + back,
-        nodule_mm=_off(chain(runs.case.nodule.centre_ras[None]), runs.truth),
-    )
+    nodule = chain(runs.case.nodule.centre_ras[None])
+    row = _spent(replace(row, nodule_mm=_off(nodule, runs.truth)), runs.cost + there, back)
     return _scored(runs.truth, maps, row, PHASES)
 
 
@@ -181,6 +194,10 @@ def _scored(truth: Truth, maps: RunMaps, row: Row, phases: Sequence[str]) -> Row
     return replace(
         row, **{f"{phase}_{what}": getattr(s, what) for phase, s in found.items() for what in ("mean", "p95")}
     )
+
+
+def _spent(row: Row, phase1: _Cost, phase2: _Cost) -> Row:
+    return replace(row, **phase1.named("phase1"), **phase2.named("phase2"), **(phase1 + phase2).named("chain"))
 
 
 def _off(predicted: Array, truth: Truth) -> float:

@@ -13,6 +13,7 @@ import jinja2
 
 from vatsloc.study.chart import PHASES, Row
 from vatsloc.study.chart_points import (
+    CLOCKS,
     MEASURES,
     PHASE_TITLES,
     PUBLISHED,
@@ -37,13 +38,13 @@ TICKS_S = {
 TICKS_MM = (0.2, 0.5, 1, 2, 5, 10, 20, 50)
 
 
-def write_chart(rows: Sequence[Row], variants: Mapping[str, Variant], out: Path) -> None:
+def write_chart(rows: Sequence[Row], variants: Mapping[str, Variant], out: Path, clock: str = "seconds") -> None:
     """Write chart.png, .svg, .csv, .md and .html into `out`; needs matplotlib, the extra `report`."""
-    points = points_of(rows, variants)
+    points = points_of(rows, variants, clock)
     write_table(points, out / "chart.csv")
-    (out / "chart.md").write_text(page(rows, points), encoding="utf-8")
-    (out / "chart.html").write_text(interactive(rows, variants), encoding="utf-8")
-    draw(points, [out / "chart.png", out / "chart.svg"])
+    (out / "chart.md").write_text(page(rows, points, clock), encoding="utf-8")
+    (out / "chart.html").write_text(interactive(rows, variants, clock), encoding="utf-8")
+    draw(points, [out / "chart.png", out / "chart.svg"], clock)
 
 
 def write_table(points: Sequence[Point], path: Path) -> None:
@@ -56,10 +57,11 @@ def write_table(points: Sequence[Point], path: Path) -> None:
             writer.writerow([p.phase, p.variant, p.says, *numbers, p.n, " ".join(p.front)])
 
 
-def page(rows: Sequence[Row], points: Sequence[Point]) -> str:
+def page(rows: Sequence[Row], points: Sequence[Point], clock: str = "seconds") -> str:
     """Tables per phase, what there is to say of the presets, and what failed, as Markdown."""
     cases = sorted({row.case for row in rows})
-    lines = [f"Cases: {', '.join(cases)}. mm are averages over the cases, seconds their medians.", ""]
+    head = f"Cases: {', '.join(cases)}. mm are averages over the cases, s medians: {CLOCKS[clock]}."
+    lines = [head, ""]
     for phase in PHASES:
         panel = sorted((p for p in points if p.phase == phase), key=lambda p: p.seconds)
         lines += [f"### {PHASE_TITLES[phase]}", "", "| variant | | mean, mm | 95 %, mm | s | cases | on the front of |"]
@@ -75,12 +77,13 @@ def page(rows: Sequence[Row], points: Sequence[Point]) -> str:
     return "\n".join(lines)
 
 
-def interactive(rows: Sequence[Row], variants: Mapping[str, Variant]) -> str:
+def interactive(rows: Sequence[Row], variants: Mapping[str, Variant], clock: str = "seconds") -> str:
     """One HTML page with every point of all cases and of each one."""
-    sets = {"all cases": points_of(rows, variants)}
-    sets |= {case: points_of(rows, variants, case) for case in sorted({row.case for row in rows})}
+    sets = {"all cases": points_of(rows, variants, clock)}
+    sets |= {case: points_of(rows, variants, clock, case) for case in sorted({row.case for row in rows})}
     data: dict[str, Any] = {
         "phases": PHASE_TITLES,
+        "clock": CLOCKS[clock],
         "measures": MEASURES,
         "sets": {name: [asdict(p) for p in points] for name, points in sets.items()},
         "published": [asdict(p) for p in PUBLISHED],
@@ -92,7 +95,7 @@ def interactive(rows: Sequence[Row], variants: Mapping[str, Variant]) -> str:
     return environment.get_template("chart.html").render(data=text)
 
 
-def draw(points: Sequence[Point], paths: Sequence[Path]) -> None:
+def draw(points: Sequence[Point], paths: Sequence[Path], clock: str = "seconds") -> None:
     """A row of panels for the mean and one for 95 %, a column per phase, logarithmic axes."""
     import matplotlib
 
@@ -104,6 +107,7 @@ def draw(points: Sequence[Point], paths: Sequence[Path]) -> None:
     for axes_row, measure in zip(grid, MEASURES, strict=True):
         for axes, phase in zip(axes_row, PHASES, strict=True):
             _panel(axes, [p for p in points if p.phase == phase], phase, measure)
+            axes.set_xlabel(CLOCKS[clock])
     for path in paths:
         metadata = {"Date": None} if path.suffix == ".svg" else None
         figure.savefig(path, dpi=110, metadata=metadata)
@@ -125,7 +129,7 @@ def _panel(axes: Any, panel: Sequence[Point], phase: str, measure: str) -> None:
             where = (published.seconds[0] * published.seconds[1]) ** 0.5, max(published.mm)
             _label(axes, published.says, where, GREEN, (0, 8), "center")
     axes.set(xscale="log", yscale="log", title=f"{PHASE_TITLES[phase]}, {MEASURES[measure]}")
-    axes.set(xlabel="seconds, kernels compiled", ylabel="target registration error, mm")
+    axes.set(ylabel="target registration error, mm")
     axes.margins(x=0.18, y=0.12)
     shown_s = [s for s in TICKS_S if axes.get_xlim()[0] <= s <= axes.get_xlim()[1]]
     axes.set_xticks(shown_s, [TICKS_S[s] for s in shown_s])

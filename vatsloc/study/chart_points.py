@@ -20,8 +20,8 @@ MEASURES = {"mean": "mean", "p95": "95 %"}
 
 @dataclass(frozen=True)
 class Point:
-    """A variant in one panel. mean, p95: target registration errors in mm, averaged over cases; seconds: their median;
-    n: cases with an answer; front: measures for which no other point is both faster and better."""
+    """A variant in one panel. mean, p95: target registration errors in mm, averaged over cases; seconds: their median
+    by the chosen clock; n: cases with an answer; front: measures for which no other point is both faster and better."""
 
     variant: str
     says: str
@@ -51,7 +51,12 @@ PUBLISHED = (
 """Means over the landmarks of real patients; ours are simulated images. Ref: Alvarez 2021, section 8."""
 
 
-def points_of(rows: Sequence[Row], variants: Mapping[str, Variant], case: str | None = None) -> list[Point]:
+CLOCKS = {"seconds": "seconds, kernels compiled", "cpu": "processor seconds of all threads, kernels compiled"}
+
+
+def points_of(
+    rows: Sequence[Row], variants: Mapping[str, Variant], clock: str = "seconds", case: str | None = None
+) -> list[Point]:
     """A point per variant and panel that shows it, of all cases or of one; fronts hold complete points alone."""
     rows = [row for row in rows if case in (None, row.case) and row.variant in variants]
     cases = {row.case for row in rows}
@@ -62,7 +67,7 @@ def points_of(rows: Sequence[Row], variants: Mapping[str, Variant], case: str | 
             if phase not in PANELS[variant.scored]:
                 continue
             own = [row for row in rows if row.variant == name]
-            values = [[getattr(row, f"{phase}_{what}") for row in own] for what in ("mean", "p95", "seconds")]
+            values = [[getattr(row, f"{phase}_{what}") for row in own] for what in ("mean", "p95", clock)]
             good = [triple for triple in zip(*values, strict=True) if all(map(math.isfinite, triple))]
             if good:
                 mean, p95, seconds = zip(*good, strict=True)

@@ -21,10 +21,13 @@ def quiet(_message: str) -> None:
 
 @dataclass
 class Stages:
-    """Log of a run. seconds and peak_mb: by stage name, in the order they ran; skipped: stage -> why."""
+    """Log of a run. seconds, cpu_seconds (all threads) and peak_mb: by stage name, in the order they ran; skipped:
+    stage -> why.
+    """
 
     say: Say = quiet
     seconds: dict[str, float] = field(default_factory=dict)
+    cpu_seconds: dict[str, float] = field(default_factory=dict)
     peak_mb: dict[str, float] = field(default_factory=dict)
     skipped: dict[str, str] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
@@ -38,12 +41,13 @@ class Stages:
         """
         self.say(f"{name} ...")
         reset = _reset_peak()
-        start = time.perf_counter()
+        start, start_cpu = time.perf_counter(), time.process_time()
         try:
             yield
         except ValueError as error:
             raise InputRefused(f"The stage '{name}' cannot work with these images: {error}.") from error
         self.seconds[name] = round(time.perf_counter() - start, 3)
+        self.cpu_seconds[name] = round(time.process_time() - start_cpu, 3)
         self.peak_mb[name] = round(_peak_mb(reset), 1)
         self.say(f"{name}: {self.seconds[name]:.1f} s")
 
