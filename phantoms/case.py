@@ -15,7 +15,7 @@ from phantoms.imaging import Picture, State, image_state, nodule_mask
 from phantoms.measures import measure
 from phantoms.spec import SPECS, PhantomSpec
 from phantoms.states import make_states, scanned_centre
-from phantoms.thorax import Thorax, ct_grid, draw_lung_trees, draw_thorax, image_body
+from phantoms.thorax import Thorax, ct_grid, draw_lung_trees, draw_thorax, image_body, operated_lung
 from registration.volume import Grid, Mask, Volume
 
 Array = NDArray[Any]
@@ -60,9 +60,8 @@ def make_case(spec: PhantomSpec | str, seed: int = 0) -> PhantomCase:
     if spec.side not in ("right", "left"):
         raise ValueError(f"side must be 'right' or 'left', got {spec.side!r}")
     rng = np.random.default_rng([seed, 11])
-    thorax = draw_thorax(spec.side, spec.habitus, spec.lesion, seed)
-    lung = thorax.shapes.lung(spec.side)
-    lung = lung.crop(lung.values < 0, 24.0)
+    thorax = draw_thorax(spec.side, spec.habitus, spec.lesion, seed, spec.fused)
+    lung = operated_lung(thorax.shapes, spec.side)
     states, gravity, ends = make_states(thorax, lung, spec, rng)
     ct, body, ct_lung = _ct(thorax, lung, spec, rng)
     view = scanned_centre(thorax) + spec.view
@@ -118,7 +117,7 @@ def _ct(thorax: Thorax, lung: Lattice, spec: PhantomSpec, rng: np.random.Generat
     distance = thorax.shapes.lung(spec.side).on(grid)
     tissue = thorax.parenchyma.on(grid)
     inside = distance < width
-    tissue[inside] += thorax.fissure.density(grid.points()[inside])
+    tissue[inside] += thorax.lobes.fissures.density(grid.points()[inside])
     hu = body + coverage(distance, width) * (tissue - body)
     draw_lung_trees(hu, thorax.trees[thorax.index(spec.side)], grid, width)
     _paint_nodule(hu, grid, thorax, width)

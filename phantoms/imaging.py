@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 
 from phantoms.cage import CageMotion
 from phantoms.fields import Lattice, coverage, refine, smoothstep
+from phantoms.lobes import LobedMap
 from phantoms.spline import SplineMap, determinant
 from phantoms.thorax import LungTrees, Nodule, Thorax, draw_lung_trees
 from registration.volume import Grid, Mask, Volume
@@ -29,7 +30,7 @@ class State:
     lung: Lattice
     cavity: Lattice
     motion: CageMotion
-    lung_map: SplineMap
+    lung_map: LobedMap
     held: bool
     pose: Array
     samples: Array
@@ -71,7 +72,7 @@ def image_state(thorax: Thorax, body: Volume, state: State, grid: Grid) -> Pictu
     del x
     edge = state.lung.sample(source) * np.cbrt(ratio)
     share = np.ones_like(edge) if state.held else coverage(edge, width)
-    resting = thorax.parenchyma.sample(source) + thorax.fissure.density(source)
+    resting = thorax.parenchyma.sample(source) + thorax.lobes.fissures.density(source)
     lesion = coverage(thorax.nodule.distance(source) * np.cbrt(ratio), width) * share
     resting += lesion * (thorax.nodule.density(source) - resting)
     tissue = np.minimum((resting + 1000) / ratio - 1000, 40.0)

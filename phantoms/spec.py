@@ -23,7 +23,8 @@ class Collapse:
     """What happens to the lung between the images. inflated, deflated: volume over that in the CT; dome_rise: mm the
     diaphragm rises further when the lung collapses, negative where insufflated gas pushes it down; shift: mm the
     mediastinum falls; gas: "air" or "co2"; patchiness: factor on how uneven the tissue is; atelectasis: share of the
-    lung, behind and below, that has lost its gas before the first cone-beam CT."""
+    lung, behind and below, that has lost its gas before the first cone-beam CT; lobes_apart: deviation of the logarithm of
+    the lobes' rest volumes, where one traps gas and another empties."""
 
     inflated: float = 0.87
     deflated: float = 0.52
@@ -32,13 +33,15 @@ class Collapse:
     gas: str = "air"
     patchiness: float = 1.0
     atelectasis: float = 0.0
+    lobes_apart: float = 0.0
 
 
 @dataclass(frozen=True)
 class PhantomSpec:
     """What to make. side: operated; habitus: "average" or "obese"; ct_spacing, cbct_spacing: mm; view: (3,) mm the
     cone-beam CTs' field of view is off its usual place; element: mm between nodes of the lung's map; refused: whether
-    the images show too little for an answer."""
+    the images show too little for an answer; fused: share of the fissures' area where lobes have grown together, 1 for a
+    lung in one piece."""
 
     name: str
     side: str
@@ -48,6 +51,7 @@ class PhantomSpec:
     view: tuple[float, float, float] = (0.0, 0.0, 0.0)
     element: float = 15.0
     refused: bool = False
+    fused: float = 1.0
     lesion: Lesion = field(default_factory=Lesion)
     collapse: Collapse = field(default_factory=Collapse)
     scanner: Scanner = field(default_factory=Scanner)

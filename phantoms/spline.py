@@ -47,6 +47,11 @@ class SplineMap:
         mapped, f = self.with_gradient(samples)
         near = cKDTree(mapped).query(targets)[1]
         source = samples[near] + np.einsum("nij,nj->ni", np.linalg.inv(f)[near], targets - mapped[near])
+        return self.follow(targets, source, tolerance_mm)
+
+    def follow(self, points: Array, start: Array, tolerance_mm: float = 1e-4) -> tuple[Array, Array]:
+        """Sources (n, 3) of `points` (n, 3) by Newton's method from the sources `start` (n, 3); what is left, (n,) mm."""
+        targets, source = np.ascontiguousarray(points, dtype=np.float64), np.array(start, dtype=np.float64)
         left = np.empty(len(targets))
         _newton(self.coefficients, self.origin, self.spacing, targets, source, left, tolerance_mm)
         return source, left

@@ -12,9 +12,10 @@ from scipy.spatial.transform import Rotation
 from phantoms.cage import CageMotion, fit_dome
 from phantoms.fields import Lattice, coverage, smooth_noise, smoothstep
 from phantoms.imaging import State
+from phantoms.lobes import surface_points
 from phantoms.spec import Collapse, PhantomSpec
 from phantoms.thorax import Thorax
-from phantoms.tissue import Equilibrium, Hilum, Pleura, Tissue, pleura_points, relax, tissue_points
+from phantoms.tissue import Equilibrium, Hilum, Pleura, Tissue, relax, tissue_points
 
 Array = NDArray[Any]
 
@@ -37,32 +38,47 @@ def make_states(
     )
     gravity = np.array([-sign, 0.15, 0.05]) + rng.normal(0, 0.03, 3)
     gravity /= np.linalg.norm(gravity)
-    points, volume = tissue_points(lung, spec.element / 2)
-    surface, area = pleura_points(lung, 2)
+    lobes = thorax.lobes
+    points, volume, lobe = _by_lobe([tissue_points(region, spec.element / 2) for region in lobes.regions])
+    surface = _by_lobe([surface_points(region, 2) for region in lobes.regions])
     hilum = thorax.hila[thorax.index(spec.side)]
-    tied = points[np.linalg.norm(points - hilum, axis=1) < 20]
-    shear, slack = _uneven(thorax, lung, points, collapse, rng)
+    tied = np.linalg.norm(points - hilum, axis=1) < 20
+    shear, slack = _uneven(thorax, lung, points, lobe, collapse, rng)
     rest = np.cbrt(np.clip(collapse.deflated * slack, 0.15, 0.95))
     poses = _poses(scanned_centre(thorax), rng)
     states, ends = [], []
     for motion, held, pose in ((inflated_motion, True, poses[0]), (deflated_motion, False, poses[1])):
         cavity = motion.carry(lung)
         end = relax(
-            Tissue(points, volume, shear, rest, 165.0),
-            Pleura(surface, area, cavity, held),
-            Hilum(tied, motion(tied), 300.0),
+            Tissue(points, volume, shear, rest, 165.0, lobe),
+            _pleura(surface, lung, cavity, held),
+            Hilum(points[tied], motion(points[tied]), 300.0, lobe[tied]),
             gravity,
             motion,
             None if held else collapse.deflated,
             spec.element,
+            lobes,
         )
         ends.append(end)
         states.append(State(lung, cavity, motion, end.state_from_ct, held, pose, points))
     return (states[0], states[1]), gravity, ends
 
 
+def _by_lobe(parts: list[tuple[Array, Array]]) -> tuple[Array, Array, Array]:
+    """Points, what each stands for, and the lobe of each, from those of every lobe."""
+    points, share = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return points, share, np.repeat(np.arange(len(parts)), [len(p) for p, _ in parts])
+
+
+def _pleura(surface: tuple[Array, Array, Array], lung: Lattice, cavity: Lattice, held: bool) -> Pleura:
+    """What touches the wall: all of the lobes' surfaces where they are free, only their outer sides where held."""
+    points, area, lobe = surface
+    outer = lung.sample(points) > -1.5 if held and lobe.max() > 0 else np.full(len(points), True)
+    return Pleura(points[outer], area[outer], cavity, held, lobe[outer])
+
+
 def _uneven(
-    thorax: Thorax, lung: Lattice, points: Array, collapse: Collapse, rng: np.random.Generator
+    thorax: Thorax, lung: Lattice, points: Array, lobe: Array, collapse: Collapse, rng: np.random.Generator
 ) -> tuple[Array, Array]:
     """Shear modulus (kPa) and factor on the rest volume: patchy tissue, soft fissure, stiff root, airless tissue and
     nodule."""
@@ -70,13 +86,21 @@ def _uneven(
     hilum = thorax.hila[thorax.index(thorax.side)]
     shear = 0.65 * np.exp(0.45 * patchiness * lung.like(smooth_noise(lung, 32.0, rng)).at(points))
     slack = np.exp(0.22 * patchiness * lung.like(smooth_noise(lung, 38.0, rng)).at(points))
+    slack *= np.exp(collapse.lobes_apart * _odds(len(thorax.lobes.regions), thorax.seed))[lobe]
     shear *= 1 + 5 * np.exp(-((np.linalg.norm(points - hilum, axis=1) / 24) ** 2))
-    shear *= 1 - 0.85 * np.exp(-((thorax.fissure.distance(points) / 8) ** 2))
+    fissures = thorax.lobes.fissures
+    shear *= 1 - 0.85 * np.exp(-((fissures.distance(points) / 8) ** 2)) * fissures.grown(points)
     airless = _airless(points, collapse.atelectasis)
     shear *= 1 + 5 * airless
     slack *= 1 - 0.75 * airless
     lesion = coverage(thorax.nodule.distance(points), 8.0)
     return shear * (1 + (thorax.nodule.stiffening - 1) * lesion), slack + lesion * (1.6 - slack)
+
+
+def _odds(count: int, seed: int) -> Array:
+    """Numbers (count,) of zero mean and unit deviation, drawn from a seed; zero for a single one."""
+    z = np.random.default_rng([seed, 4]).standard_normal(count)
+    return np.asarray((z - z.mean()) / max(z.std(), 1e-9))
 
 
 def _airless(points: Array, share: float) -> Array:

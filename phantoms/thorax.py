@@ -11,6 +11,7 @@ from scipy import ndimage
 
 from phantoms.anatomy import Build, Shapes, draw_build, make_shapes, spine_y
 from phantoms.fields import Lattice, coverage, smooth_noise, smoothstep
+from phantoms.lobes import Fissures, Lobes, Sheet, cut, whole
 from phantoms.skeleton import Vertebra, draw_bones, draw_spine
 from phantoms.spec import Lesion
 from phantoms.trees import Tree, draw_tubes, grow, tubes
@@ -59,29 +60,9 @@ class Nodule:
 
 
 @dataclass(frozen=True)
-class Fissure:
-    """Oblique fissure between the lobes of a lung. hilum: (3,) RAS mm, which it passes; slope: mm up per mm back;
-    bow: mm the sheet bulges at 60 mm from the hilum."""
-
-    hilum: Array
-    slope: float
-    bow: float
-
-    def distance(self, points: Array) -> Array:
-        """Distance in mm of points (..., 3) in the CT from the sheet, positive above it."""
-        d = points - self.hilum
-        bulge = self.bow * ((d[..., 0] ** 2 + d[..., 1] ** 2) / 3600 - 0.5)
-        return (d[..., 2] + self.slope * d[..., 1] + 8 + bulge) / np.sqrt(1 + self.slope**2)
-
-    def density(self, points: Array) -> Array:
-        """HU that the sheet of pleura adds at points (..., 3)."""
-        return 150 * np.exp(-((self.distance(points) / 0.9) ** 2))
-
-
-@dataclass(frozen=True)
 class Thorax:
-    """A person. parenchyma: HU of the lung's tissue without its trees, in the CT; hila: (right, left) RAS mm; fissure:
-    that of the operated lung."""
+    """A person. parenchyma: HU of the lung's tissue without its trees, in the CT; hila: (right, left) RAS mm; lobes:
+    those of the operated lung."""
 
     shapes: Shapes
     spine: list[Vertebra]
@@ -89,7 +70,7 @@ class Thorax:
     hila: tuple[Array, Array]
     trees: tuple[LungTrees, LungTrees]
     nodule: Nodule
-    fissure: Fissure
+    lobes: Lobes
     side: str
     seed: int
 
@@ -103,18 +84,38 @@ class Thorax:
         return 0 if side == "right" else 1
 
 
-def draw_thorax(side: str, habitus: str, lesion: Lesion, seed: int) -> Thorax:
-    """Person with a lesion in the lung on `side`, drawn from a seed."""
+def draw_thorax(side: str, habitus: str, lesion: Lesion, seed: int, fused: float = 1.0) -> Thorax:
+    """Person with a lesion in the lung on `side`, drawn from a seed. fused: share of the fissures' area over which the
+    operated lung's lobes have grown together."""
     rng = np.random.default_rng([seed, 1])
     build = draw_build(rng, habitus)
     shapes = make_shapes(build)
     spine = draw_spine(build, float(shapes.body.origin[2]), build.apex + 16, rng)
     hila = (_hilum(shapes.right_lung, 1), _hilum(shapes.left_lung, -1))
-    trees = (_lung_trees(shapes.right_lung, hila[0], 1, rng), _lung_trees(shapes.left_lung, hila[1], -1, rng))
-    centre = _place_nodule(shapes.lung(side), build, lesion, 1 if side == "right" else -1, rng)
+    own = 0 if side == "right" else 1
+    lung = operated_lung(shapes, side)
+    parts = None if fused >= 1 else _cut(lung, hila[own], side, fused, seed)
+    regions = [(shapes.right_lung,), (shapes.left_lung,)]
+    regions[own] = regions[own] if parts is None else parts.regions
+    trees = (lung_trees(regions[0], hila[0], 1, rng), lung_trees(regions[1], hila[1], -1, rng))
+    centre = _place_nodule(shapes.lung(side), build, lesion, 1 - 2 * own, parts, rng)
     nodule = Nodule(centre, lesion.radius, 0.12 * lesion.radius, lesion.kind)
-    fissure = Fissure(hila[0 if side == "right" else 1], rng.uniform(0.7, 1.1), rng.uniform(-8, 8))
-    return Thorax(shapes, spine, _parenchyma(shapes, rng), hila, trees, nodule, fissure, side, seed)
+    line = Sheet(hila[own], 8.0, rng.uniform(0.7, 1.1), rng.uniform(-8, 8))
+    lobes = parts or whole(lung, Fissures(line, None, np.inf))
+    return Thorax(shapes, spine, _parenchyma(shapes, rng), hila, trees, nodule, lobes, side, seed)
+
+
+def operated_lung(shapes: Shapes, side: str) -> Lattice:
+    """Signed distance (mm) of the lung on `side`, on no more of the lattice than it needs."""
+    lung = shapes.lung(side)
+    return lung.crop(lung.values < 0, 24.0)
+
+
+def _cut(lung: Lattice, hilum: Array, side: str, fused: float, seed: int) -> Lobes:
+    rng = np.random.default_rng([seed, 3])
+    oblique = Sheet(hilum, 8.0, rng.uniform(0.7, 1.1), rng.uniform(-8, 8))
+    horizontal = Sheet(hilum, rng.uniform(-8, 0), rng.uniform(-0.1, 0.1), rng.uniform(-6, 6))
+    return cut(lung, Fissures(oblique, horizontal if side == "right" else None), fused)
 
 
 def ct_grid(thorax: Thorax, spacing: tuple[float, float, float]) -> Grid:
@@ -240,42 +241,53 @@ def _hilum(lung: Lattice, sign: int) -> Array:
     return line[inside[0]] if len(inside) else line[60]
 
 
-def _lung_trees(lung: Lattice, hilum: Array, sign: int, rng: np.random.Generator) -> LungTrees:
-    coarse = np.argwhere(lung.values[::2, ::2, ::2] < -1.0) * 2.0 * lung.spacing + lung.origin
-    cloud = coarse + rng.uniform(-3, 3, coarse.shape)
+def lung_trees(regions: tuple[Lattice, ...], hilum: Array, sign: int, rng: np.random.Generator) -> LungTrees:
+    """Trees of a lung that enter at `hilum` (3,) mm and fill its lobes (signed distances, mm) one by one; sign: 1 right,
+    -1 left."""
+    clouds = []
+    for region in regions:
+        coarse = np.argwhere(region.values[::2, ::2, ::2] < -1.0) * 2.0 * region.spacing + region.origin
+        clouds.append(coarse + rng.uniform(-3, 3, coarse.shape))
     inward = np.array([sign * 12.0, -2.0, -6.0])
-    bundle = grow(cloud, hilum - 0.6 * inward, hilum + 0.8 * inward, 24, 0.68, 2.8)
+    bundle = grow(clouds, hilum - 0.6 * inward, hilum + 0.8 * inward, 24, 0.68, 2.8)
     veins = grow(
-        cloud + rng.uniform(-5, 5, cloud.shape),
+        [cloud + rng.uniform(-5, 5, cloud.shape) for cloud in clouds],
         hilum + np.array([0, 12, -14]) - 0.6 * inward,
         hilum + np.array([0, 11, -16]) + 0.8 * inward,
         24,
         0.64,
         2.8,
     )
-    bundle, veins = (t.moved(_keep_inside(t, lung)) for t in (bundle, veins))
+    bundle, veins = (t.moved(_keep_inside(t, regions, 4.0)) for t in (bundle, veins))
     across = rng.standard_normal(bundle.nodes.shape)
     across /= np.linalg.norm(across, axis=1, keepdims=True)
     across = 0.3 * across + 0.7 * np.array([0.3 * sign, 0.5, 0.8])
     artery = bundle.moved(bundle.nodes + across * (2.1 * bundle.radius[:, None] + 0.8))
+    if len(regions) > 1:
+        artery = artery.moved(_keep_inside(artery, regions, 2.0))
     bronchi = bundle.moved(bundle.nodes, 0.72).keep(bundle.generation <= 7)
     return LungTrees(bronchi, artery, veins)
 
 
-def _keep_inside(tree: Tree, lung: Lattice) -> Array:
-    """Nodes (n, 3) of a tree, those that left the lung brought back 4 mm below its surface."""
+def _keep_inside(tree: Tree, regions: tuple[Lattice, ...], depth_mm: float) -> Array:
+    """Nodes (n, 3) of a tree, those that left the lobe they feed brought back `depth_mm` below its surface."""
     nodes = tree.nodes.copy()
-    beyond = tree.generation > 1
-    for _ in range(4):
-        distance, slope = lung.with_gradient(nodes[beyond])
-        steep = np.maximum((slope**2).sum(axis=1, keepdims=True), 0.25)
-        nodes[beyond] -= np.maximum(distance + 4, 0)[:, None] * slope / steep
+    for n, region in enumerate(regions):
+        beyond = (tree.generation > 1) & (tree.cloud == n)
+        for _ in range(4):
+            distance, slope = region.with_gradient(nodes[beyond])
+            steep = np.maximum((slope**2).sum(axis=1, keepdims=True), 0.25)
+            nodes[beyond] -= np.maximum(distance + depth_mm, 0)[:, None] * slope / steep
     return nodes
 
 
-def _place_nodule(lung: Lattice, build: Build, lesion: Lesion, sign: int, rng: np.random.Generator) -> Array:
+def _place_nodule(
+    lung: Lattice, build: Build, lesion: Lesion, sign: int, lobes: Lobes | None, rng: np.random.Generator
+) -> Array:
     points = lung.points()
     apt = np.abs(lung.values.ravel() + lesion.depth) < 1.5
+    if lobes is not None:
+        apt &= lobes.fissures.distance(points) > 1.2 * lesion.radius + 2
     z, dome = points[:, 2], build.dome[0 if sign == 1 else 1]
     level, inner = {
         "middle": (np.abs(z + 45) < 45, 55),

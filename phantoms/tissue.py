@@ -2,75 +2,74 @@
 
 The CT is the reference. The tissue's own rest shape is smaller by the factor `rest`; the chest wall holds it open.
     W(F) = rest^3 w(F / rest),   w(G) = mu/2 (tr G^T G - 3 - 2 ln det G) + lambda/2 (ln det G)^2
-Energy is minimized over the coefficients of a spline map by limited-memory quasi-Newton steps.
-Ref: Bonet and Wood 2008, eq. 6.27 (the tissue); Liu 2017 (quasi-Newton steps in the metric of a Laplacian).
+Energy is minimized over the coefficients of spline maps, one for each lobe. Lobes touch without friction at the fissures
+and are tied together where they have grown together.
+Ref: Bonet and Wood 2008, eq. 6.27 (the tissue).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from enum import Enum
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage, sparse
 from scipy.sparse.linalg import splu
-from skimage.measure import marching_cubes
 
+from phantoms.descent import Status, minimize
 from phantoms.fields import Lattice
+from phantoms.fissure_contact import Side, contact_energy, make_joint
+from phantoms.lobes import LobedMap, Lobes
 from phantoms.spline import SplineMap, basis, cofactors, determinant
 
 Array = NDArray[Any]
-
-
-class Status(Enum):
-    """How the search for equilibrium ended."""
-
-    CONVERGED = "The out-of-balance force fell below its limit."
-    STALLED = "The energy stopped falling before the out-of-balance force was below its limit."
-    STEPS = "The allowed steps were used up."
+TOUCH_SHARE = 0.03
+"""Share of the stiffness of a fissure's contact that the metric of the steps knows: it resists no sliding."""
 
 
 @dataclass(frozen=True)
 class Tissue:
     """Lung tissue at quadrature points. points: (n, 3) RAS mm in the CT; volume: (n,) mm3; shear: (n,) kPa;
-    rest: (n,) rest length over length in the CT; density: kg/m3 in the CT."""
+    rest: (n,) rest length over length in the CT; density: kg/m3 in the CT; lobe: (n,) which one each point is of."""
 
     points: Array
     volume: Array
     shear: Array
     rest: Array
     density: float
+    lobe: Array
 
 
 @dataclass(frozen=True)
 class Pleura:
     """Surface of the lung in the CT. points: (n, 3) mm; area: (n,) mm2; cage: signed distance (mm) to the wall, in the
-    state; held: whether the wall holds the lung (inflated) or only stops it (pleural gas)."""
+    state; held: whether the wall holds the lung (inflated) or only stops it (pleural gas); lobe: (n,)."""
 
     points: Array
     area: Array
     cage: Lattice
     held: bool
+    lobe: Array
 
 
 @dataclass(frozen=True)
 class Hilum:
     """Tissue tied to the mediastinum. points: (n, 3) mm in the CT; target: (n, 3) mm in the state; stiffness: kPa mm
-    a point."""
+    a point; lobe: (n,)."""
 
     points: Array
     target: Array
     stiffness: float
+    lobe: Array
 
 
 @dataclass(frozen=True)
 class Equilibrium:
     """Result of `relax`. history: out-of-balance force per step, relative to the first."""
 
-    state_from_ct: SplineMap
+    state_from_ct: LobedMap
     status: Status
     history: Array
 
@@ -85,15 +84,6 @@ def tissue_points(lung: Lattice, step_mm: float) -> tuple[Array, Array]:
     return points[share > 0.05], share[share > 0.05] * step_mm**3
 
 
-def pleura_points(lung: Lattice, step: int) -> tuple[Array, Array]:
-    """Points (n, 3) mm on the zero level and the area (n,) mm2 each stands for."""
-    vertices, faces, _, _ = marching_cubes(lung.values, 0.0, spacing=(lung.spacing,) * 3, step_size=step)
-    a, b, c = (vertices[faces[:, m]] for m in range(3))
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
-    per_vertex = np.bincount(faces.ravel(), np.repeat(area / 3, 3), minlength=len(vertices))
-    return vertices + lung.origin, per_vertex
-
-
 def relax(
     tissue: Tissue,
     pleura: Pleura,
@@ -102,18 +92,19 @@ def relax(
     guess: Callable[[Array], Array],
     volume_ratio: float | None,
     spacing_mm: float,
+    lobes: Lobes,
 ) -> Equilibrium:
-    """Equilibrium of the lung on a spline of `spacing_mm`, from the start that maps CT points by `guess`.
+    """Equilibrium of the lung on splines of `spacing_mm`, from the start that maps CT points by `guess`.
 
     gravity: (3,) unit vector; volume_ratio: volume over that in the CT, met by scaling the rest shape; None leaves it.
     """
     low, high = tissue.points.min(axis=0) - 2.5 * spacing_mm, tissue.points.max(axis=0) + 2.5 * spacing_mm
     nx, ny, nz = (int(n) for n in np.ceil((high - low) / spacing_mm) + 1)
-    problem = _Problem(tissue, pleura, hilum, gravity, low, spacing_mm, (nx, ny, nz))
+    problem = _Problem(tissue, pleura, hilum, gravity, lobes, low, spacing_mm, (nx, ny, nz))
     u = problem.fit(guess)
     histories: list[Array] = []
     for _ in range(4):
-        u, status, history = _minimize(problem, u, histories[0][0] if histories else None)
+        u, status, history = minimize(problem, u, histories[0][0] if histories else None)
         histories.append(history)
         ratio = problem.volume(u) / float(tissue.volume.sum())
         if volume_ratio is None or abs(ratio / volume_ratio - 1) < 3e-3:
@@ -121,11 +112,11 @@ def relax(
         rest = problem.tissue.rest * np.cbrt(volume_ratio / ratio)
         problem.tissue = replace(problem.tissue, rest=np.clip(rest, 0.5, 0.99))
     forces = np.concatenate(histories)
-    return Equilibrium(SplineMap(problem.full(u), low, spacing_mm), status, forces / forces[0])
+    return Equilibrium(LobedMap(tuple(problem.maps(u)), lobes), status, forces / forces[0])
 
 
 class _Problem:
-    """Energy of the lung over the spline's active coefficients (n, 3), its gradient, and a fixed metric for steps."""
+    """Energy of the lung over the splines' active coefficients (n, 3), its gradient, and a fixed metric for steps."""
 
     def __init__(
         self,
@@ -133,17 +124,23 @@ class _Problem:
         pleura: Pleura,
         hilum: Hilum,
         gravity: Array,
+        lobes: Lobes,
         origin: Array,
         spacing: float,
         shape: tuple[int, int, int],
     ) -> None:
-        self.tissue, self.pleura, self.hilum, self.shape = tissue, pleura, hilum, shape
-        inside, *slopes = basis(tissue.points, origin, spacing, shape)
+        self.tissue, self.pleura, self.hilum, self.lobes = tissue, pleura, hilum, lobes
+        self.origin, self.spacing, self.shape = origin, spacing, shape
+        inside, *slopes = self._basis(tissue.points, tissue.lobe)
         self.active = np.flatnonzero(inside.sum(axis=0) > 0)
+        self.nearest = self._nearest_active()
         self.value = inside[:, self.active]
         self.slopes = [s[:, self.active] for s in slopes]
-        self.on_pleura = basis(pleura.points, origin, spacing, shape)[0][:, self.active]
-        self.on_hilum = basis(hilum.points, origin, spacing, shape)[0][:, self.active]
+        self.on_pleura = self._basis(pleura.points, pleura.lobe)[0][:, self.active]
+        self.on_hilum = self._basis(hilum.points, hilum.lobe)[0][:, self.active]
+        joint = make_joint(lobes, pleura.held)
+        self.sides = joint.sides
+        self.ties = [(self._jump(side), side.stiffness[:, None]) for side in joint.grown]
         self.lame = 1.5 * tissue.shear
         self.contact = (4.0 if pleura.held else 1.5) * pleura.area
         weight = tissue.density * 9.81e-6 * tissue.volume
@@ -153,18 +150,36 @@ class _Problem:
         laplace = sum((s.T @ (s * (3 * stiff)[:, None]) for s in self.slopes), start=self.smooth)
         touch = self.on_pleura.T @ (self.on_pleura * (self.contact / 3)[:, None])
         tie = self.on_hilum.T @ (self.on_hilum * hilum.stiffness)
+        for jump, stiffness in self.ties + [(self._jump(s), TOUCH_SHARE * s.stiffness[:, None]) for s in self.sides]:
+            touch = touch + jump.T @ (jump * stiffness)
         self.metric = splu(sparse.csc_array(laplace + touch + tie))
+
+    def _basis(self, points: Array, lobe: Array) -> list[sparse.csr_array]:
+        """As `basis`, with the columns of one lobe after those of another."""
+        nodes, count = int(np.prod(self.shape)), len(self.lobes.regions)
+        shift = np.repeat(np.asarray(lobe) * nodes, 27)
+        return [
+            sparse.csr_array((m.data, m.indices + shift, m.indptr), shape=(len(points), count * nodes))
+            for m in basis(points, self.origin, self.spacing, self.shape)
+        ]
+
+    def _jump(self, side: Side) -> sparse.csr_array:
+        """Displacement of the own lobe less that of the other at a side's points."""
+        n = len(side.points)
+        own, other = (self._basis(side.points, np.full(n, lobe))[0] for lobe in (side.own, side.other))
+        return sparse.csr_array((own - other)[:, self.active])
 
     def _roughness(self, spacing: float) -> sparse.csr_array:
         """Bending of the coefficients: it carries the map smoothly a little way beyond the pleura."""
-        lookup = np.full(int(np.prod(self.shape)), -1)
+        nodes = int(np.prod(self.shape))
+        lookup = np.full(len(self.lobes.regions) * nodes, -1)
         lookup[self.active] = np.arange(len(self.active))
-        grid = lookup.reshape(self.shape)
         rows = []
-        for axis in range(3):
-            a, b, c = (np.moveaxis(grid, axis, 0)[m : m + grid.shape[axis] - 2] for m in range(3))
-            ok = (a >= 0) & (b >= 0) & (c >= 0)
-            rows.append(np.stack([a[ok], b[ok], c[ok]], axis=1))
+        for grid in lookup.reshape(-1, *self.shape):
+            for axis in range(3):
+                a, b, c = (np.moveaxis(grid, axis, 0)[m : m + grid.shape[axis] - 2] for m in range(3))
+                ok = (a >= 0) & (b >= 0) & (c >= 0)
+                rows.append(np.stack([a[ok], b[ok], c[ok]], axis=1))
         index = np.concatenate(rows)
         n = len(index)
         data = np.tile([1.0, -2.0, 1.0], n) * np.sqrt(spacing)
@@ -178,17 +193,23 @@ class _Problem:
         right = self.value.T @ ((guess(t.points) - t.points) * t.volume[:, None])
         return splu(sparse.csc_array(normal)).solve(right)
 
-    def full(self, u: Array) -> Array:
-        """Coefficients on the whole lattice, the passive ones copied from their nearest active neighbour."""
+    def _nearest_active(self) -> Array:
+        """For every coefficient of every lobe, the active one of that lobe that is nearest."""
         nodes = int(np.prod(self.shape))
-        passive = np.ones(nodes, dtype=bool)
+        passive = np.ones(len(self.lobes.regions) * nodes, dtype=bool)
         passive[self.active] = False
-        out = np.zeros((nodes, 3))
-        out[self.active] = u
-        nearest = ndimage.distance_transform_edt(
-            passive.reshape(self.shape), return_distances=False, return_indices=True
-        )
-        return np.ascontiguousarray(out.reshape(*self.shape, 3)[tuple(nearest)])
+        found = []
+        for n, grid in enumerate(passive.reshape(-1, *self.shape)):
+            i, j, k = ndimage.distance_transform_edt(grid, return_distances=False, return_indices=True)
+            found.append(n * nodes + np.ravel_multi_index((i, j, k), self.shape).ravel())
+        lookup = np.full(len(passive), -1)
+        lookup[self.active] = np.arange(len(self.active))
+        return lookup[np.concatenate(found)]
+
+    def maps(self, u: Array) -> list[SplineMap]:
+        """The map of each lobe; passive coefficients are copied from their nearest active neighbour."""
+        full = u[self.nearest].reshape(-1, *self.shape, 3)
+        return [SplineMap(np.ascontiguousarray(c), self.origin, self.spacing) for c in full]
 
     def volume(self, u: Array) -> float:
         """Volume of the lung in mm3."""
@@ -223,49 +244,13 @@ class _Problem:
         gradient = gradient + self.on_pleura.T @ (push[:, None] * normal)
         pull = self.hilum.points + self.on_hilum @ u - self.hilum.target
         total += 0.5 * self.hilum.stiffness * float((pull**2).sum())
-        return total, gradient + self.hilum.stiffness * (self.on_hilum.T @ pull)
-
-
-def _minimize(
-    problem: _Problem, u: Array, first_force: float | None, steps: int = 150, limit: float = 1e-2
-) -> tuple[Array, Status, Array]:
-    """Limited-memory BFGS in the problem's metric until the force, that metric's norm of the next step, is small."""
-    value, gradient = problem.energy(u)
-    if not np.isfinite(value):
-        raise ValueError("the lung is folded at the start, reduce the motion of the cage")
-    memory: list[tuple[Array, Array, float]] = []
-    history: list[float] = []
-    while len(history) < steps:
-        step = _two_loop(problem, gradient, memory)
-        slope = float((step * gradient).sum())
-        history.append(float(np.sqrt(max(-slope, 0.0))))
-        if history[-1] <= limit * (first_force or history[0]):
-            return u, Status.CONVERGED, np.array(history)
-        t, found = 1.0, problem.energy(u + step)
-        while found[0] > value + 1e-4 * t * slope and t > 1e-3:
-            t *= 0.4
-            found = problem.energy(u + t * step)
-        if found[0] >= value:
-            if not memory:
-                return u, Status.STALLED, np.array(history)
-            memory = []
-            continue
-        y, s = found[1] - gradient, t * step
-        curvature = float((y * s).sum())
-        if curvature > 0:
-            memory = [*memory[-11:], (s, y, curvature)]
-        u, (value, gradient) = u + s, found
-    return u, Status.STEPS, np.array(history)
-
-
-def _two_loop(problem: _Problem, gradient: Array, memory: list[tuple[Array, Array, float]]) -> Array:
-    q = gradient.copy()
-    shares = []
-    for s, y, sy in reversed(memory):
-        a = float((s * q).sum()) / sy
-        q -= a * y
-        shares.append(a)
-    d = problem.metric.solve(q)
-    for (s, y, sy), a in zip(memory, reversed(shares), strict=True):
-        d += (a - float((y * d).sum()) / sy) * s
-    return -d
+        gradient = gradient + self.hilum.stiffness * (self.on_hilum.T @ pull)
+        for jump, stiffness in self.ties:
+            tear = jump @ u
+            total += 0.5 * float((stiffness * tear**2).sum())
+            gradient = gradient + jump.T @ (stiffness * tear)
+        if self.sides:
+            touching, slopes, _ = contact_energy(self.sides, self.maps(u), self.lobes.regions)
+            total += touching
+            gradient = gradient + np.stack(slopes).reshape(-1, 3)[self.active]
+        return total, gradient

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,23 +18,28 @@ Array = NDArray[Any]
 @dataclass(frozen=True)
 class Tree:
     """Branches of a rooted binary tree. nodes: (n, 3) RAS mm; parent: (n,), -1 at the root; radius: (n,) mm of the
-    branch that ends at the node; generation: (n,)."""
+    branch that ends at the node; generation: (n,); cloud: (n,) which of the clouds it grew into the branch feeds."""
 
     nodes: Array
     parent: Array
     radius: Array
     generation: Array
+    cloud: Array
 
     def moved(self, nodes: Array, scale: float = 1.0) -> Tree:
         """The same tree with its nodes elsewhere and its radii scaled."""
-        return Tree(nodes, self.parent, self.radius * scale, self.generation)
+        return Tree(nodes, self.parent, self.radius * scale, self.generation, self.cloud)
 
     def keep(self, chosen: Array) -> Tree:
         """Sub-tree of the branches where `chosen` (n,) is true; a kept branch's parent must be kept."""
         new = np.cumsum(chosen) - 1
         parent = self.parent[chosen]
         return Tree(
-            self.nodes[chosen], np.where(parent >= 0, new[parent], -1), self.radius[chosen], self.generation[chosen]
+            self.nodes[chosen],
+            np.where(parent >= 0, new[parent], -1),
+            self.radius[chosen],
+            self.generation[chosen],
+            self.cloud[chosen],
         )
 
     def forks(self) -> Array:
@@ -42,31 +48,40 @@ class Tree:
         return np.flatnonzero(np.bincount(inner, minlength=len(self.nodes)) >= 2)
 
 
-def grow(cloud: Array, root: Array, hilum: Array, leaf_points: int, leaf_radius: float, exponent: float) -> Tree:
-    """Tree from `root` through `hilum` that fills a point cloud (n, 3) by repeated halving.
+def grow(
+    clouds: Sequence[Array], root: Array, hilum: Array, leaf_points: int, leaf_radius: float, exponent: float
+) -> Tree:
+    """Tree from `root` through `hilum` that fills point clouds (n, 3) by repeated halving, each by branches of its own.
 
     Every branch runs part of the way to the middle of the points it feeds, a smaller part near the root; clouds below
     `leaf_points` end it. Radii follow r^exponent of the parent = sum over its children, from `leaf_radius` mm at the
     ends.
     Ref: Tawhai 2000 (halving); Murray 1926 (radii).
     """
-    nodes, parent, generation = [root, hilum], [-1, 0], [0, 0]
-    stack = [(cloud, 1, 1)]
+    nodes, parent, generation, feeds = [root, hilum], [-1, 0], [0, 0], [0, 0]
+    stack: list[tuple[Array, int, int, int]] = []
+
+    def branch(points: Array, at: int, depth: int, cloud: int) -> None:
+        leaf = len(points) < leaf_points
+        share = 0.95 if leaf else min(0.26 + 0.025 * depth, 0.45)
+        nodes.append(nodes[at] + share * (points.mean(axis=0) - nodes[at]))
+        parent.append(at)
+        generation.append(depth)
+        feeds.append(cloud)
+        if not leaf:
+            stack.append((points, len(nodes) - 1, depth + 1, cloud))
+
+    if len(clouds) == 1:
+        stack.append((clouds[0], 1, 1, 0))
+    else:
+        for n, points in enumerate(clouds):
+            branch(points, 1, 1, n)
     while stack:
-        points, at, depth = stack.pop()
-        along = nodes[at] - nodes[parent[at]]
-        for half in _halves(points, along):
-            start = nodes[at]
-            leaf = len(half) < leaf_points
-            share = 0.95 if leaf else min(0.26 + 0.025 * depth, 0.45)
-            end = start + share * (half.mean(axis=0) - start)
-            nodes.append(end)
-            parent.append(at)
-            generation.append(depth)
-            if not leaf:
-                stack.append((half, len(nodes) - 1, depth + 1))
+        points, at, depth, cloud = stack.pop()
+        for half in _halves(points, nodes[at] - nodes[parent[at]]):
+            branch(half, at, depth, cloud)
     radius = _radii(np.array(parent), leaf_radius, exponent)
-    return Tree(np.array(nodes), np.array(parent), radius, np.array(generation))
+    return Tree(np.array(nodes), np.array(parent), radius, np.array(generation), np.array(feeds))
 
 
 def _halves(points: Array, along: Array) -> tuple[Array, Array]:
