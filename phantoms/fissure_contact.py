@@ -22,7 +22,7 @@ Array = NDArray[Any]
 NEAR_MM = 30.0
 """Surfaces further apart than this in the CT are not looked at for contact."""
 REACH_MM = 8.0
-LOST_MM = 1e-3
+FOUND_MM, LOST_MM = 1e-7, 1e-3
 CONTACT_KPA_MM = 2.0
 TIE_KPA_MM = 2.0
 
@@ -82,7 +82,7 @@ def contact_energy(
     for side in sides:
         own, other, region = maps[side.own], maps[side.other], regions[side.other]
         x = own(side.points)
-        place, left = other.follow(x, side.place)
+        place, left = other.follow(x, side.place, FOUND_MM)
         phi, slope = region.with_gradient(place)
         good = (left < LOST_MM) & (np.abs(phi) < REACH_MM)
         side.place = np.where((left < LOST_MM)[:, None], place, side.points)

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from phantoms.cage import CageMotion
 from phantoms.fields import Lattice, coverage, refine, smoothstep
 from phantoms.lobes import LobedMap
-from phantoms.spline import SplineMap, determinant
+from phantoms.spline import SplineMap
 from phantoms.thorax import LungTrees, Nodule, Thorax, draw_lung_trees
 from registration.volume import Grid, Mask, Volume
 
@@ -68,9 +68,8 @@ def image_state(thorax: Thorax, body: Volume, state: State, grid: Grid) -> Pictu
     hu = _walls(body, state, grid)
     room = coverage(state.cavity.sample(x), width)
     within = np.flatnonzero(room > 0)
-    source, ratio = _lung_sources(state, grid, within)
     del x
-    edge = state.lung.sample(source) * np.cbrt(ratio)
+    source, ratio, edge = _lung_sources(state, grid, within)
     share = np.ones_like(edge) if state.held else coverage(edge, width)
     resting = thorax.parenchyma.sample(source) + thorax.lobes.fissures.density(source)
     lesion = coverage(thorax.nodule.distance(source) * np.cbrt(ratio), width) * share
@@ -135,26 +134,34 @@ def _walls(body: Volume, state: State, grid: Grid) -> Array:
     return ndimage.map_coordinates(body.hu, index, order=1, mode="nearest", prefilter=False)
 
 
-def _lung_sources(state: State, grid: Grid, within: Array) -> tuple[Array, Array]:
-    """CT points (n, 3) of the voxels `within` (flat indices) and volume ratios (n,), continued beyond the lung."""
+def _lung_sources(state: State, grid: Grid, within: Array) -> tuple[Array, Array, Array]:
+    """CT points (n, 3) of the voxels `within` (flat indices), volume ratios (n,), and distances (n,) in mm to the
+    surface of the lobe that a voxel lies deepest in, negative inside; continued beyond the lung."""
     coarse, step = _coarse(grid, 4.5)
     x = state.unposed(coarse.points().reshape(-1, 3))
     room = state.cavity.sample(x) < 2.0 * step * grid.spacing.max()
-    mapped = state.lung_map(state.samples)
-    source = np.zeros((len(x), 3))
-    ratio = np.ones(len(x))
-    found, left = state.lung_map.inverse(x[room], state.samples, 1e-3)
-    near = _nearest(mapped, x[room])
-    plain = state.samples[near] + 1.5 * (x[room] - mapped[near])
-    bad = (left > 0.01) | (np.linalg.norm(x[room] - mapped[near], axis=1) > 14)
+    source, ratio = np.zeros((len(within), 3), dtype=np.float32), np.ones(len(within), dtype=np.float32)
+    edge = np.full(len(within), np.inf, dtype=np.float32)
+    for piece, region in zip(state.lung_map.pieces, state.lung_map.lobes.regions, strict=True):
+        samples = state.samples[region.sample(state.samples) < 6.0]
+        fields = _piece_sources(piece, samples, x, room).reshape(*coarse.shape, 4)
+        fine = np.stack([refine(fields[..., m], step, grid.shape).ravel()[within] for m in range(4)], axis=1)
+        distance = region.sample(fine[:, :3]) * np.cbrt(fine[:, 3])
+        deeper = distance < edge
+        source[deeper], ratio[deeper], edge[deeper] = fine[deeper, :3], fine[deeper, 3], distance[deeper]
+    return source, ratio, edge
+
+
+def _piece_sources(piece: SplineMap, samples: Array, x: Array, room: Array) -> Array:
+    """CT points and volume ratios (n, 4) of points x (n, 3) of the state where `room` (n,) says; plain beyond it."""
+    out = np.zeros((len(x), 4))
+    out[:, 3] = 1.0
+    mapped = piece(samples)
+    found, left = piece.inverse(x[room], samples, 1e-3)
+    gap, near = cKDTree(mapped).query(x[room])
+    plain = samples[near] + 1.5 * (x[room] - mapped[near])
+    bad = (left > 0.01) | (gap > 14)
     found[bad] = plain[bad]
-    source[room] = found
-    ratio[room] = np.clip(determinant(state.lung_map.with_gradient(found)[1]), 0.2, 3.0)
-    fields = np.concatenate([source, ratio[:, None]], axis=1).reshape(*coarse.shape, 4)
-    fine = np.stack([refine(fields[..., m], step, grid.shape).ravel()[within] for m in range(4)], axis=1)
-    return fine[:, :3], fine[:, 3]
-
-
-def _nearest(cloud: Array, points: Array) -> Array:
-
-    return cKDTree(cloud).query(points)[1]
+    out[room, :3] = found
+    out[room, 3] = np.clip(piece.determinant(found), 0.2, 3.0)
+    return out

@@ -23,8 +23,8 @@ class Collapse:
     """What happens to the lung between the images. inflated, deflated: volume over that in the CT; dome_rise: mm the
     diaphragm rises further when the lung collapses, negative where insufflated gas pushes it down; shift: mm the
     mediastinum falls; gas: "air" or "co2"; patchiness: factor on how uneven the tissue is; atelectasis: share of the
-    lung, behind and below, that has lost its gas before the first cone-beam CT; lobes_apart: deviation of the logarithm of
-    the lobes' rest volumes, where one traps gas and another empties."""
+    lung, behind and below, that has lost its gas before the first cone-beam CT; lobes_apart: deviation of the logarithm
+    of the lobes' rest volumes, where one traps gas and another empties."""
 
     inflated: float = 0.87
     deflated: float = 0.52
@@ -40,8 +40,8 @@ class Collapse:
 class PhantomSpec:
     """What to make. side: operated; habitus: "average" or "obese"; ct_spacing, cbct_spacing: mm; view: (3,) mm the
     cone-beam CTs' field of view is off its usual place; element: mm between nodes of the lung's map; refused: whether
-    the images show too little for an answer; fused: share of the fissures' area where lobes have grown together, 1 for a
-    lung in one piece."""
+    the images show too little for an answer; fused: share of the fissures' area where lobes have grown together, 1 for
+    a lung in one piece."""
 
     name: str
     side: str
@@ -65,17 +65,23 @@ SPECS = {
         replace(_SMALL, name="demo", collapse=Collapse(inflated=0.89, deflated=0.55, patchiness=0.6)),
         replace(_SMALL, name="small-right"),
         replace(_SMALL, name="small-left", side="left"),
-        PhantomSpec("right", "right"),
+        PhantomSpec("right", "right", fused=0.5, collapse=Collapse(lobes_apart=0.1)),
         PhantomSpec("left", "left", lesion=Lesion(depth=25.0), collapse=Collapse(inflated=0.83)),
-        PhantomSpec("small-collapse", "right", collapse=Collapse(deflated=0.64, dome_rise=0.0)),
-        PhantomSpec("near-total-collapse", "left", collapse=Collapse(deflated=0.40, dome_rise=12.0)),
-        PhantomSpec("co2-right", "right", lesion=Lesion(depth=20.0, radius=6.0), collapse=_CO2),
+        PhantomSpec("small-collapse", "right", fused=0.8, collapse=Collapse(deflated=0.64, dome_rise=0.0)),
+        PhantomSpec(
+            "near-total-collapse", "left", fused=0.0, collapse=Collapse(deflated=0.40, dome_rise=12.0, lobes_apart=0.2)
+        ),
+        PhantomSpec("co2-right", "right", fused=0.3, lesion=Lesion(depth=20.0, radius=6.0), collapse=_CO2),
         PhantomSpec("co2-left", "left", lesion=Lesion(radius=10.0), collapse=replace(_CO2, deflated=0.46)),
         PhantomSpec("high-diaphragm", "right", "obese", lesion=Lesion(depth=10.0), collapse=Collapse(dome_rise=14.0)),
-        PhantomSpec("apex", "left", view=(0.0, 0.0, 45.0), lesion=Lesion(place="apex", depth=12.0, radius=7.0)),
-        PhantomSpec("base", "right", lesion=Lesion(place="base", depth=10.0), collapse=Collapse(patchiness=1.4)),
+        PhantomSpec(
+            "apex", "left", view=(0.0, 0.0, 45.0), fused=0.4, lesion=Lesion(place="apex", depth=12.0, radius=7.0)
+        ),
+        PhantomSpec(
+            "base", "right", fused=0.0, lesion=Lesion(place="base", depth=10.0), collapse=Collapse(lobes_apart=0.1)
+        ),
         PhantomSpec("ground-glass", "right", lesion=Lesion("ground-glass", depth=18.0, radius=9.0)),
-        PhantomSpec("part-solid", "left", lesion=Lesion("part-solid", radius=11.0)),
+        PhantomSpec("part-solid", "left", fused=0.2, lesion=Lesion("part-solid", radius=11.0)),
         PhantomSpec(
             "tight-view",
             "left",
@@ -83,8 +89,8 @@ SPECS = {
             lesion=Lesion(radius=7.0),
             scanner=Scanner(fov=190.0, length=130.0),
         ),
-        PhantomSpec("poor-dose", "left", lesion=Lesion(radius=6.0), scanner=Scanner(noise=60.0)),
-        PhantomSpec("atelectasis", "right", collapse=Collapse(atelectasis=0.10)),
+        PhantomSpec("poor-dose", "left", fused=0.6, lesion=Lesion(radius=6.0), scanner=Scanner(noise=60.0)),
+        PhantomSpec("atelectasis", "right", fused=0.5, collapse=Collapse(atelectasis=0.10)),
         PhantomSpec(
             "too-little-seen",
             "right",

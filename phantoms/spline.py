@@ -50,7 +50,7 @@ class SplineMap:
         return self.follow(targets, source, tolerance_mm)
 
     def follow(self, points: Array, start: Array, tolerance_mm: float = 1e-4) -> tuple[Array, Array]:
-        """Sources (n, 3) of `points` (n, 3) by Newton's method from the sources `start` (n, 3); what is left, (n,) mm."""
+        """Sources (n, 3) of `points` (n, 3) by Newton's method from `start` (n, 3); what is left, (n,) mm."""
         targets, source = np.ascontiguousarray(points, dtype=np.float64), np.array(start, dtype=np.float64)
         left = np.empty(len(targets))
         _newton(self.coefficients, self.origin, self.spacing, targets, source, left, tolerance_mm)

@@ -18,6 +18,8 @@ from phantoms.thorax import Thorax
 from phantoms.tissue import Equilibrium, Hilum, Pleura, Tissue, relax, tissue_points
 
 Array = NDArray[Any]
+HINGE_MM = 13.0
+"""Around the hilum, tissue of a lung in lobes is tied to the mediastinum this far, so that lobes may swing."""
 
 
 def make_states(
@@ -42,7 +44,7 @@ def make_states(
     points, volume, lobe = _by_lobe([tissue_points(region, spec.element / 2) for region in lobes.regions])
     surface = _by_lobe([surface_points(region, 2) for region in lobes.regions])
     hilum = thorax.hila[thorax.index(spec.side)]
-    tied = np.linalg.norm(points - hilum, axis=1) < 20
+    tied = np.linalg.norm(points - hilum, axis=1) < (20.0 if len(lobes.regions) == 1 else HINGE_MM)
     shear, slack = _uneven(thorax, lung, points, lobe, collapse, rng)
     rest = np.cbrt(np.clip(collapse.deflated * slack, 0.15, 0.95))
     poses = _poses(scanned_centre(thorax), rng)

@@ -95,7 +95,7 @@ def draw_thorax(side: str, habitus: str, lesion: Lesion, seed: int, fused: float
     own = 0 if side == "right" else 1
     lung = operated_lung(shapes, side)
     parts = None if fused >= 1 else _cut(lung, hila[own], side, fused, seed)
-    regions = [(shapes.right_lung,), (shapes.left_lung,)]
+    regions: list[tuple[Lattice, ...]] = [(shapes.right_lung,), (shapes.left_lung,)]
     regions[own] = regions[own] if parts is None else parts.regions
     trees = (lung_trees(regions[0], hila[0], 1, rng), lung_trees(regions[1], hila[1], -1, rng))
     centre = _place_nodule(shapes.lung(side), build, lesion, 1 - 2 * own, parts, rng)
@@ -242,8 +242,8 @@ def _hilum(lung: Lattice, sign: int) -> Array:
 
 
 def lung_trees(regions: tuple[Lattice, ...], hilum: Array, sign: int, rng: np.random.Generator) -> LungTrees:
-    """Trees of a lung that enter at `hilum` (3,) mm and fill its lobes (signed distances, mm) one by one; sign: 1 right,
-    -1 left."""
+    """Trees of a lung that enter at `hilum` (3,) mm and fill its lobes (signed distances, mm) one by one; sign: 1
+    right, -1 left."""
     clouds = []
     for region in regions:
         coarse = np.argwhere(region.values[::2, ::2, ::2] < -1.0) * 2.0 * region.spacing + region.origin

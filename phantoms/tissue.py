@@ -2,8 +2,8 @@
 
 The CT is the reference. The tissue's own rest shape is smaller by the factor `rest`; the chest wall holds it open.
     W(F) = rest^3 w(F / rest),   w(G) = mu/2 (tr G^T G - 3 - 2 ln det G) + lambda/2 (ln det G)^2
-Energy is minimized over the coefficients of spline maps, one for each lobe. Lobes touch without friction at the fissures
-and are tied together where they have grown together.
+Energy is minimized over the coefficients of spline maps, one for each lobe. Lobes touch without friction at the
+fissures and are tied where they have grown together.
 Ref: Bonet and Wood 2008, eq. 6.27 (the tissue).
 """
 
@@ -93,10 +93,12 @@ def relax(
     volume_ratio: float | None,
     spacing_mm: float,
     lobes: Lobes,
+    limit: float = 1e-2,
 ) -> Equilibrium:
     """Equilibrium of the lung on splines of `spacing_mm`, from the start that maps CT points by `guess`.
 
-    gravity: (3,) unit vector; volume_ratio: volume over that in the CT, met by scaling the rest shape; None leaves it.
+    gravity: (3,) unit vector; volume_ratio: volume over that in the CT, met by scaling the rest shape; None leaves it;
+    limit: out-of-balance force at which to stop, over that of the start.
     """
     low, high = tissue.points.min(axis=0) - 2.5 * spacing_mm, tissue.points.max(axis=0) + 2.5 * spacing_mm
     nx, ny, nz = (int(n) for n in np.ceil((high - low) / spacing_mm) + 1)
@@ -104,7 +106,7 @@ def relax(
     u = problem.fit(guess)
     histories: list[Array] = []
     for _ in range(4):
-        u, status, history = minimize(problem, u, histories[0][0] if histories else None)
+        u, status, history = minimize(problem, u, histories[0][0] if histories else None, limit=limit)
         histories.append(history)
         ratio = problem.volume(u) / float(tissue.volume.sum())
         if volume_ratio is None or abs(ratio / volume_ratio - 1) < 3e-3:
@@ -133,7 +135,7 @@ class _Problem:
         self.origin, self.spacing, self.shape = origin, spacing, shape
         inside, *slopes = self._basis(tissue.points, tissue.lobe)
         self.active = np.flatnonzero(inside.sum(axis=0) > 0)
-        self.nearest = self._nearest_active()
+        self.spread = self._spread()
         self.value = inside[:, self.active]
         self.slopes = [s[:, self.active] for s in slopes]
         self.on_pleura = self._basis(pleura.points, pleura.lobe)[0][:, self.active]
@@ -193,22 +195,21 @@ class _Problem:
         right = self.value.T @ ((guess(t.points) - t.points) * t.volume[:, None])
         return splu(sparse.csc_array(normal)).solve(right)
 
-    def _nearest_active(self) -> Array:
-        """For every coefficient of every lobe, the active one of that lobe that is nearest."""
+    def _spread(self) -> sparse.csr_array:
+        """Matrix that gives every coefficient of every lobe the value of that lobe's nearest active one."""
         nodes = int(np.prod(self.shape))
-        passive = np.ones(len(self.lobes.regions) * nodes, dtype=bool)
-        passive[self.active] = False
-        found = []
-        for n, grid in enumerate(passive.reshape(-1, *self.shape)):
-            i, j, k = ndimage.distance_transform_edt(grid, return_distances=False, return_indices=True)
-            found.append(n * nodes + np.ravel_multi_index((i, j, k), self.shape).ravel())
-        lookup = np.full(len(passive), -1)
+        lookup = np.full(len(self.lobes.regions) * nodes, -1)
         lookup[self.active] = np.arange(len(self.active))
-        return lookup[np.concatenate(found)]
+        found = []
+        for grid in lookup.reshape(-1, *self.shape):
+            i, j, k = ndimage.distance_transform_edt(grid < 0, return_distances=False, return_indices=True)
+            found.append(grid[i, j, k].ravel())
+        n = len(lookup)
+        return sparse.csr_array((np.ones(n), np.concatenate(found), np.arange(n + 1)), shape=(n, len(self.active)))
 
     def maps(self, u: Array) -> list[SplineMap]:
         """The map of each lobe; passive coefficients are copied from their nearest active neighbour."""
-        full = u[self.nearest].reshape(-1, *self.shape, 3)
+        full = (self.spread @ u).reshape(-1, *self.shape, 3)
         return [SplineMap(np.ascontiguousarray(c), self.origin, self.spacing) for c in full]
 
     def volume(self, u: Array) -> float:
@@ -252,5 +253,5 @@ class _Problem:
         if self.sides:
             touching, slopes, _ = contact_energy(self.sides, self.maps(u), self.lobes.regions)
             total += touching
-            gradient = gradient + np.stack(slopes).reshape(-1, 3)[self.active]
+            gradient = gradient + self.spread.T @ np.stack(slopes).reshape(-1, 3)
         return total, gradient

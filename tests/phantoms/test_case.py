@@ -12,6 +12,8 @@ from scipy import ndimage
 from phantoms import SPECS, PhantomCase, PhantomSpec, make_case
 from phantoms.cbct import scanner_grid
 from phantoms.imaging import State, image_state
+from phantoms.lobes import Fissures
+from phantoms.measures import fissure_jump, lobe_overlap
 from phantoms.trees import Tree
 from registration.volume import Volume, axis_codes
 
@@ -25,38 +27,43 @@ def _states(case: PhantomCase) -> list[tuple[str, State, Volume]]:
     ]
 
 
-def test_map_and_inverse_agree_at_two_thousand_points(demo: PhantomCase) -> None:
-    for n, (_, state, _) in enumerate(_states(demo)):
-        moved = demo.dense_truth[:, 3 * n + 3 : 3 * n + 6]
+def test_map_and_inverse_agree_at_two_thousand_points(case: PhantomCase) -> None:
+    for n, (_, state, _) in enumerate(_states(case)):
+        moved = case.dense_truth[:, 3 * n + 3 : 3 * n + 6]
         back, left = state.to_ct(moved)
-        assert_allclose(back, demo.dense_truth[:, :3], atol=0.01)
+        off = np.linalg.norm(back - case.dense_truth[:, :3], axis=1)
+        # Lobes press a little into each other: there, and only there, two sources claim a place.
+        beside = case.thorax.lobes.fissures.distance(case.dense_truth[:, :3]) < 1.0
+        assert off[~beside | (len(state.lung_map.pieces) == 1)].max() < 0.01
         assert left.max() < 0.01
 
 
-def test_no_tissue_is_folded(demo: PhantomCase) -> None:
-    lung = demo.inflated.lung
+def test_no_tissue_is_folded(case: PhantomCase) -> None:
+    lung = case.inflated.lung
     points = lung.points()[lung.values.ravel() < 0]
-    for _, state, _ in _states(demo):
+    for _, state, _ in _states(case):
         assert state.lung_map.determinant(points).min() > 0.1
 
 
-def test_volumes_are_those_asked_for(demo: PhantomCase) -> None:
-    inflated, deflated = demo.info["volume_ratio"]
+def test_volumes_are_those_asked_for(case: PhantomCase) -> None:
+    inflated, deflated = case.info["volume_ratio"]
     # The held pleura hangs a tenth of a millimetre off the wall, which costs the inflated lung some volume.
-    assert inflated == pytest.approx(demo.spec.collapse.inflated, abs=0.03)
-    assert deflated == pytest.approx(demo.spec.collapse.deflated, abs=0.015)
+    assert inflated == pytest.approx(case.spec.collapse.inflated, abs=0.03)
+    assert deflated == pytest.approx(case.spec.collapse.deflated, abs=0.015)
 
 
-def test_mass_of_the_lung_is_kept(demo: PhantomCase) -> None:
-    nothing = Tree(np.zeros((1, 3)), np.array([-1]), np.zeros(1), np.zeros(1, dtype=int))
-    bare = replace(demo.thorax.trees[0], airway=nothing, artery=nothing, vein=nothing)
-    far = replace(demo.thorax.nodule, centre=np.array([1e4, 0.0, 0.0]))
-    sheet = replace(demo.thorax.fissure, hilum=np.array([0.0, 0.0, 1e4]))
-    thorax = replace(demo.thorax, trees=(bare, bare), nodule=far, fissure=sheet)
-    lung = demo.inflated.lung
+def test_mass_of_the_lung_is_kept(case: PhantomCase) -> None:
+    nothing = Tree(np.zeros((1, 3)), np.array([-1]), np.zeros(1), np.zeros(1, dtype=int), np.zeros(1, dtype=int))
+    bare = replace(case.thorax.trees[0], airway=nothing, artery=nothing, vein=nothing)
+    far = replace(case.thorax.nodule, centre=np.array([1e4, 0.0, 0.0]))
+    lobes = case.thorax.lobes
+    away = replace(lobes.fissures.oblique, hilum=np.array([0.0, 0.0, 1e4]))
+    lobes = replace(lobes, fissures=Fissures(away, None))
+    thorax = replace(case.thorax, trees=(bare, bare), nodule=far, lobes=lobes)
+    lung = case.inflated.lung
     inside = lung.values.ravel() < 0
     before = (thorax.parenchyma.at(lung.points()[inside]) + 1000).sum() * lung.spacing**3
-    for _, state, _ in _states(demo):
+    for _, state, _ in _states(case):
         middle = state.posed(state.lung_map(state.samples)).mean(axis=0)
         grid = scanner_grid(middle, (2.5, 2.5, 2.5), 340.0, 260.0)
         body = Volume(np.full((4, 4, 4), -1000, dtype=np.float32), np.diag([1.0, 1, 1, 1]))
@@ -65,16 +72,43 @@ def test_mass_of_the_lung_is_kept(demo: PhantomCase) -> None:
         assert after == pytest.approx(before, rel=0.01)
 
 
-def test_lung_slides_along_the_wall_and_stays_on_it(demo: PhantomCase) -> None:
-    lung, state = demo.inflated.lung, demo.inflated
+def test_lung_slides_along_the_wall_and_stays_on_it(case: PhantomCase) -> None:
+    lung, state = case.inflated.lung, case.inflated
     points = lung.points()
     skin = points[(np.abs(lung.values.ravel()) < 1.0) & (points[:, 0] > 85) & (points[:, 2] > -60)]
     _, normal = lung.with_gradient(skin)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     jump = state.lung_map(skin) - state.motion(skin)
     along = np.linalg.norm(jump - (jump * normal).sum(axis=1, keepdims=True) * normal, axis=1)
-    assert along.mean() > 2.5
+    assert along.mean() > 3.0
     assert np.abs(state.cavity.at(state.lung_map(skin)) - lung.at(skin)).mean() < 0.6
+
+
+def test_lobes_slide_along_the_fissures_and_part_only_when_collapsed(lobed: PhantomCase) -> None:
+    (slid_held, parted_held), (slid, parted) = (fissure_jump(s) for s in (lobed.inflated, lobed.deflated))
+    assert np.linalg.norm(slid_held, axis=1).mean() > 2.0
+    assert np.abs(parted_held).mean() < 0.5
+    assert np.linalg.norm(slid, axis=1).max() > 10.0
+    assert np.percentile(parted, 95) > 2.0
+    assert max(np.percentile(lobe_overlap(s), 99) for s in (lobed.inflated, lobed.deflated)) < 0.4
+    assert lobed.info["fissure_slip_mm"][1][2] == pytest.approx(np.linalg.norm(slid, axis=1).max())
+
+
+def test_landmarks_and_nodule_lie_inside_one_lobe(lobed: PhantomCase) -> None:
+    lobes = lobed.thorax.lobes
+    depth = np.sort([r.at(lobed.landmarks_ct) for r in lobes.regions], axis=0)
+    assert depth[0].max() < -1.0
+    assert depth[1].min() > 0.5
+    assert len(set(lobes.at(lobed.landmarks_ct))) == 3
+    nodule = np.argwhere(lobed.nodule.inside)
+    assert len(set(lobes.at(lobed.nodule.grid.to_ras(nodule)))) == 1
+
+
+def test_vessels_feed_their_own_lobe(lobed: PhantomCase) -> None:
+    lobes = lobed.thorax.lobes
+    for tree in (lobed.thorax.trees[0].airway, lobed.thorax.trees[0].artery, lobed.thorax.trees[0].vein):
+        fine = tree.generation > 2
+        assert np.array_equal(lobes.at(tree.nodes[fine]), tree.cloud[fine])
 
 
 def test_collapsed_lung_sinks_inside_its_room(demo: PhantomCase) -> None:

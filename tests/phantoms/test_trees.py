@@ -16,7 +16,7 @@ def cloud() -> np.ndarray:
 
 
 def test_radii_follow_murray_at_every_fork(cloud: np.ndarray) -> None:
-    tree = grow(cloud, np.array([-20.0, 0, 0]), np.zeros(3), 30, 0.6, 3.0)
+    tree = grow([cloud], np.array([-20.0, 0, 0]), np.zeros(3), 30, 0.6, 3.0)
     inner = np.unique(tree.parent[tree.parent >= 0])
     below = np.bincount(tree.parent[1:], tree.radius[1:] ** 3, minlength=len(tree.nodes))
     assert_allclose(tree.radius[inner] ** 3, below[inner])
@@ -26,22 +26,33 @@ def test_radii_follow_murray_at_every_fork(cloud: np.ndarray) -> None:
 
 
 def test_tree_comes_close_to_every_point(cloud: np.ndarray) -> None:
-    tree = grow(cloud, np.array([-20.0, 0, 0]), np.zeros(3), 30, 0.6, 3.0)
+    tree = grow([cloud], np.array([-20.0, 0, 0]), np.zeros(3), 30, 0.6, 3.0)
     gap = np.linalg.norm(cloud[::20, None] - tree.nodes[None], axis=2).min(axis=1)
     assert gap.max() < 25
     assert gap.mean() < 10
 
 
 def test_kept_branches_still_hang_together(cloud: np.ndarray) -> None:
-    tree = grow(cloud, np.array([-20.0, 0, 0]), np.zeros(3), 30, 0.6, 3.0)
+    tree = grow([cloud], np.array([-20.0, 0, 0]), np.zeros(3), 30, 0.6, 3.0)
     top = tree.keep(tree.generation <= 4)
     full = {tuple(n): tuple(tree.nodes[p]) for n, p in zip(tree.nodes[1:], tree.parent[1:], strict=True)}
     assert all(full[tuple(n)] == tuple(top.nodes[p]) for n, p in zip(top.nodes[1:], top.parent[1:], strict=True))
     assert top.generation.max() == 4
 
 
+def test_every_cloud_is_fed_by_branches_of_its_own(cloud: np.ndarray) -> None:
+    low = cloud[:, 2] < 0
+    tree = grow([cloud[low], cloud[~low]], np.array([-20.0, 0, 0]), np.zeros(3), 30, 0.6, 3.0)
+    assert set(tree.cloud[2:]) == {0, 1}
+    child = np.flatnonzero(tree.parent > 1)
+    assert np.array_equal(tree.cloud[child], tree.cloud[tree.parent[child]])
+    # Branches end between points of a convex cloud, so they stay on its side.
+    assert (tree.nodes[2:, 2][tree.cloud[2:] == 0] < 0).all()
+    assert (tree.nodes[2:, 2][tree.cloud[2:] == 1] > 0).all()
+
+
 def test_tubes_start_and_end_at_nodes(cloud: np.ndarray) -> None:
-    tree = grow(cloud, np.array([-20.0, 0, 0]), np.zeros(3), 200, 0.6, 3.0)
+    tree = grow([cloud], np.array([-20.0, 0, 0]), np.zeros(3), 200, 0.6, 3.0)
     ends, radii = tubes(tree, 0.1, np.random.default_rng(0))
     pieces = ends.reshape(-1, 3, 2, 3)
     assert_allclose(pieces[:, 0, 0], tree.nodes[tree.parent[1:]])

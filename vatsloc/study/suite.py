@@ -17,6 +17,9 @@ _COLUMNS = {
     "collapse": lambda i: _two(i["pneumothorax_mm"][:2]),
     "affine leaves %": lambda i: f"{100 * i['affine_share'][1]:.0f}",
     "wall slip": lambda i: _two(i["wall_slip_mm"][1][:2]),
+    "lobes": lambda i: str(len(i["lobes"])),
+    "fissures fused %": lambda i: f"{100 * i['spec']['fused']:.0f}",
+    "fissure slip": lambda i: _two(i["fissure_slip_mm"][1][::2]),
     "volume ratio": lambda i: " / ".join(f"{v:.2f}" for v in i["volume_ratio"]),
     "diaphragm up": lambda i: _two(i["dome_mm"]),
     "landmarks": lambda i: str(i["n_landmarks"]),
@@ -39,8 +42,8 @@ def write_suite(folder: Path, jobs: int = 1, say: Say = quiet) -> dict[str, dict
 
 
 def table(suite: dict[str, dict[str, Any]]) -> str:
-    """Markdown table, a line a case: mean / 95 % in mm at the landmarks where two numbers stand; volume and diaphragm
-    (mm) inflated / deflated; the affine column and the slip are those of the collapse."""
+    """Markdown table, a line a case: mean / 95 % in mm at the landmarks where two numbers stand; fissure slip mean /
+    max in mm; volume and diaphragm (mm) inflated / deflated; affine column and slips are those of the collapse."""
     lines = ["| case | " + " | ".join(_COLUMNS) + " |", "|---" * (len(_COLUMNS) + 1) + "|"]
     lines += [
         f"| {name} | " + " | ".join(cell(info) for cell in _COLUMNS.values()) + " |" for name, info in suite.items()
@@ -50,7 +53,8 @@ def table(suite: dict[str, dict[str, Any]]) -> str:
     lines.append("")
     lines.append(
         f"The best affine map leaves {100 * min(shares):.0f} to {100 * max(shares):.0f} % of the collapse, "
-        f"more than 20 % in {100 * hard:.0f} % of the cases."
+        f"more than 20 % in {100 * hard:.0f} % of the cases. Lobes slide along the fissures by up to "
+        f"{max(info['fissure_slip_mm'][1][2] for info in suite.values()):.0f} mm."
     )
     return "\n".join(lines)
 
