@@ -49,8 +49,9 @@ class Job:
 @dataclass(frozen=True)
 class Outcome:
     """How one case ended. exit_code: of localize, negative where a signal ended it; seconds: wall time of localize;
-    peak_mb: of its process; says: the last line of localize or evaluate, whichever failed; evaluate_code: exit code of
-    evaluate, None where it had nothing to score; scores: tre.json, or None; asked: case, its date, preset, settings."""
+    peak_mb: as run.json says, else that of its process, no less than this one's; says: the last line of localize or
+    evaluate, whichever failed; evaluate_code: exit code of evaluate, None where it had nothing to score; scores:
+    tre.json, or None; asked: case, its date, preset, settings."""
 
     name: str
     exit_code: int
@@ -153,6 +154,7 @@ def run_one(job: Job) -> Outcome:
         scores = json.loads((result / "tre.json").read_text(encoding="utf-8")) if evaluated == 0 else None
         said = said if evaluated else outcome.says
         outcome = replace(outcome, failed_gates=gates, evaluate_code=evaluated, scores=scores, says=said)
+        outcome = replace(outcome, peak_mb=run["peak_mb"])
     write_whole(job.folder / OUTCOME_FILE, json.dumps(asdict(outcome), indent=1) + "\n")
     return outcome
 
