@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
+from numba import njit
 from scipy.linalg import lapack
 from scipy.sparse import csr_matrix
 
@@ -30,10 +32,8 @@ class Cholesky:
         """Solutions for one (n,) or many (n, k) right-hand sides."""
         if len(right) != self.size:
             raise ValueError(f"right-hand side must have {self.size} rows, got {len(right)}")
-        order = _unknowns(self.tree.order, self.block)
+        order, spans, rows = self._order, self._spans, self._borders
         y = np.asarray(right, float)[order]
-        rows = [_unknowns(f.border, self.block) for f in self.tree.fronts]
-        spans = [slice(f.first * self.block, f.last * self.block) for f in self.tree.fronts]
         for span, border, inverse, below in zip(spans, rows, self.diagonal_inverse, self.below, strict=True):
             y[span] = inverse @ y[span]
             if len(border):
@@ -47,6 +47,51 @@ class Cholesky:
         solution = np.empty_like(y)
         solution[order] = y
         return solution
+
+    def inverse_at(self, unknowns: Array, dtype: type = np.float64) -> Array:
+        """The inverse's rows and columns of distinct unknowns (k,), (k, k), computed and kept as `dtype`.
+
+        A unit load reaches only the fronts above it, so that it costs a fraction of k solutions.
+        """
+        place = np.empty(self.size, np.int64)
+        place[self._order] = np.arange(self.size)
+        rank = np.argsort(place[unknowns])
+        inner = place[unknowns][rank]
+        result: Array = np.zeros((len(inner), len(inner)), dtype)
+        spread: list[tuple[int, Array]] = []  # first column and rows below the front of the forward solution
+        for front, span, border, inverse, below in zip(
+            self.tree.fronts, self._spans, self._borders, self.diagonal_inverse, self.below, strict=True
+        ):
+            own = span.stop - span.start
+            first, last = np.searchsorted(inner, [span.start, span.stop])
+            start = min([first, *(spread[c][0] for c in front.children)])
+            x = np.zeros((own + len(border), last - start), dtype)
+            x[inner[first:last] - span.start, np.arange(first, last) - start] = 1
+            rows = np.concatenate([np.arange(span.start, span.stop), border])
+            for child in front.children:
+                column, update = spread[child]
+                x[np.searchsorted(rows, self._borders[child]), column - start : column - start + update.shape[1]] += (
+                    update
+                )
+                spread[child] = (column, update[:0])
+            w: Array = inverse.astype(dtype, copy=False) @ x[:own]
+            result[start:last, start:last] += w.T @ w
+            spread.append((start, x[own:] - below.astype(dtype, copy=False) @ w))
+        back = np.empty_like(rank)
+        back[rank] = np.arange(len(rank))
+        return result[np.ix_(back, back)]
+
+    @cached_property
+    def _order(self) -> Array:
+        return _unknowns(self.tree.order, self.block)
+
+    @cached_property
+    def _spans(self) -> list[slice]:
+        return [slice(f.first * self.block, f.last * self.block) for f in self.tree.fronts]
+
+    @cached_property
+    def _borders(self) -> list[Array]:
+        return [_unknowns(f.border, self.block) for f in self.tree.fronts]
 
 
 def cholesky(matrix: csr_matrix, tree: Tree, block: int) -> Cholesky:
@@ -91,8 +136,17 @@ def _assemble(permuted: csr_matrix, tree: Tree, front: Front, block: int, pendin
         update = pending[child]
         if update is not None and len(update):
             place = np.searchsorted(unknowns, _unknowns(tree.fronts[child].border, block))
-            dense[np.ix_(place, place)] += update
+            _add_lower(dense, update, place)
     return dense
+
+
+@njit(cache=True)
+def _add_lower(dense: Array, update: Array, place: Array) -> None:
+    """Add the lower triangle of an update at increasing places."""
+    for i in range(len(place)):
+        row = dense[place[i]]
+        for j in range(i + 1):
+            row[place[j]] += update[i, j]
 
 
 def _unknowns(nodes: Array, block: int) -> Array:

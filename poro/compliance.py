@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numba import njit
 
 from poro.mesh.tetmesh import Array
-from poro.solver import LinearSolver
+from poro.solver import LinearSolver, inverse_at
 
+DOUBLE_UNKNOWNS = 3000
 GROUPS = 128  # of contact nodes: about 2 cm of a lung's surface each
 
 
@@ -17,77 +19,60 @@ GROUPS = 128  # of contact nodes: about 2 cm of a lung's surface each
 class Groups:
     """Contact nodes taken together.
 
-    label: (nc,) group; share: (g,) one over the nodes of a group; motion: (g, nc, 3, 3) displacements of all nodes
-    under a unit force spread over a group, by direction of the force (last).
+    label: (nc,) group; share: (g,) one over the nodes of a group; motion: (nc, 3, g, 3) displacements of all nodes
+    under a unit force spread over a group, by direction of the force (last); mean: (g, 3, g, 3) of it over groups.
     """
 
     label: Array
     share: Array
     motion: Array
+    mean: Array
 
 
 class Compliance:
-    """Lazy columns of the compliance matrix of nc nodes; serves every load and every wall position of one lung.
+    """Compliance matrix of nc contact nodes; serves every load and every wall position of one lung.
 
     solver: of the free unknowns; unknowns: (nc, 3) rows of the contact nodes among them; size: how many there are.
+    The matrix of more than `DOUBLE_UNKNOWNS` unknowns is kept in single precision, exact to about 4e-7 of its largest
+    entry.
     """
 
     def __init__(self, solver: LinearSolver, unknowns: Array, size: int) -> None:
         self._solver = solver
         self._unknowns = unknowns
         self._size = size
-        self._place = np.full(len(unknowns), -1)
-        self._blocks = np.zeros((0, len(unknowns), 3, 3))
-        self._known = 0
         self._groups: Groups | None = None
 
-    @property
-    def columns(self) -> int:
-        """Number of nodes whose columns are known."""
-        return self._known
-
-    def require(self, nodes: Array, batch: int = 128) -> None:
-        """Solve for the columns of contact nodes (k,) that are not known yet."""
-        missing = nodes[self._place[nodes] < 0]
-        if len(missing) == 0:
-            return
-        needed = self._known + len(missing)
-        if needed > len(self._blocks):
-            grown = np.zeros((min(max(needed, 3 * needed // 2), len(self._unknowns)), *self._blocks.shape[1:]))
-            grown[: self._known] = self._blocks[: self._known]
-            self._blocks = grown
-        for first in range(0, len(missing), batch):
-            chunk = missing[first : first + batch]
-            right = np.zeros((self._size, 3 * len(chunk)))
-            right[self._unknowns[chunk].ravel(), np.arange(3 * len(chunk))] = 1
-            u = self._solver.solve(right)[self._unknowns].reshape(len(self._unknowns), 3, len(chunk), 3)
-            self._blocks[self._known : self._known + len(chunk)] = u.transpose(2, 0, 1, 3)
-            self._place[chunk] = self._known + np.arange(len(chunk))
-            self._known += len(chunk)
+    @cached_property
+    def matrix(self) -> Array:
+        """Symmetric (3 nc, 3 nc), mm per kPa mm2."""
+        double = self._unknowns.size <= DOUBLE_UNKNOWNS
+        return inverse_at(self._solver, self._unknowns.ravel(), self._size, np.float64 if double else np.float32)
 
     def groups(self, points: Array) -> Groups:
-        """The nodes at points (nc, 3) in groups of neighbours; solved for once."""
+        """The nodes at points (nc, 3) in groups of neighbours; found once."""
         if self._groups is None:
             label = _bisect(points, GROUPS)
-            count = np.bincount(label)
-            right = np.zeros((self._size, len(count), 3))
+            share = 1 / np.bincount(label)
+            shape = (len(share), 3, len(share), 3)
+            spread: Array = np.zeros((len(label), *shape[1:]), self.matrix.dtype)
             for axis in range(3):
-                right[self._unknowns[:, axis], label, axis] = 1 / count[label]
-            u = self._solver.solve(right.reshape(self._size, -1))[self._unknowns]
-            motion = u.reshape(len(label), 3, len(count), 3).transpose(2, 0, 1, 3)
-            self._groups = Groups(label, 1 / count, np.ascontiguousarray(motion))
+                spread[np.arange(len(label)), axis, label, axis] = share[label]
+            flat = spread.reshape(3 * len(label), -1)
+            motion = self.matrix @ flat
+            mean = np.asarray(flat.T @ motion, float).reshape(shape)
+            self._groups = Groups(label, share, motion.reshape(spread.shape), mean)
         return self._groups
 
-    def between(self, rows: Array, along: Array, columns: Array, push: Array) -> Array:
-        """Motion (k, l) of contact nodes `rows` along (k, 3) under unit forces at nodes `columns` along push (l, 3)."""
-        self.require(np.unique(columns))
-        return _between(self._blocks, rows, along, self._place[columns], push)
+    def between(self, nodes: Array, along: Array) -> Array:
+        """Motion (k, k) of contact nodes (k,) along directions (k, 3) under unit forces at them along these."""
+        return _between(self.matrix, nodes, along)
 
     def apply(self, force: Array) -> Array:
         """Displacements (nc, 3) of all contact nodes under forces (nc, 3), most of them zero."""
-        columns = np.flatnonzero(force.any(axis=1))
-        self.require(columns)
-        return _apply(self._blocks, self._place[columns], force[columns])
+        flat = force.ravel()
+        loaded = np.flatnonzero(flat)
+        return _apply(self.matrix, loaded, flat[loaded]).reshape(-1, 3)
 
 
 def _bisect(points: Array, groups: int) -> Array:
@@ -106,30 +91,35 @@ def _bisect(points: Array, groups: int) -> Array:
 
 
 @njit(cache=True)
-def _between(blocks: Array, rows: Array, along: Array, columns: Array, push: Array) -> Array:
-    result = np.empty((len(columns), len(rows)))
-    for j in range(len(columns)):
-        block = blocks[columns[j]]
-        for i in range(len(rows)):
-            c = block[rows[i]]
-            total = 0.0
-            for a in range(3):
-                total += along[i, a] * (c[a, 0] * push[j, 0] + c[a, 1] * push[j, 1] + c[a, 2] * push[j, 2])
+def _between(matrix: Array, nodes: Array, along: Array) -> Array:
+    count, last = len(nodes), 0
+    result = np.empty((count, count))
+    row = np.empty(matrix.shape[1])
+    for i in range(count):
+        n = nodes[i]
+        last = max(last, 3 * n + 3)
+        x, y, z = along[i, 0], along[i, 1], along[i, 2]
+        first, second, third = matrix[3 * n], matrix[3 * n + 1], matrix[3 * n + 2]
+        for c in range(last):
+            row[c] = x * first[c] + y * second[c] + z * third[c]
+        for j in range(i + 1):
+            c = 3 * nodes[j]
+            total = along[j, 0] * row[c] + along[j, 1] * row[c + 1] + along[j, 2] * row[c + 2]
+            result[i, j] = total
             result[j, i] = total
-    return result.T
+    return result
 
 
 @njit(cache=True)
-def _apply(blocks: Array, columns: Array, force: Array) -> Array:
-    u = np.zeros((blocks.shape[1], 3))
-    width = 128
-    for chunk in range((blocks.shape[1] + width - 1) // width):
-        last = min((chunk + 1) * width, blocks.shape[1])
-        for j in range(len(columns)):
-            x, y, z = force[j, 0], force[j, 1], force[j, 2]
-            block = blocks[columns[j]]
-            for i in range(chunk * width, last):
-                c = block[i]
-                for a in range(3):
-                    u[i, a] += c[a, 0] * x + c[a, 1] * y + c[a, 2] * z
+def _apply(matrix: Array, rows: Array, force: Array) -> Array:
+    size = matrix.shape[1]
+    u = np.zeros(size)
+    width = 1024
+    for first in range(0, size, width):
+        part = u[first : min(first + width, size)]
+        for k in range(len(rows)):
+            row = matrix[rows[k], first : first + width]
+            f = force[k]
+            for j in range(len(part)):
+                part[j] += f * row[j]
     return u

@@ -1,6 +1,7 @@
 """Frictionless Signorini contact with a rigid surface by a primal-dual active set on the compliance of contact nodes.
 
-Ref: Alvarez 2021, eqs. 12-14; Hueber & Wohlmuth 2005 (primal-dual active set); Murty 1974 (least-index pivoting).
+Ref: Alvarez 2021, eqs. 12-14; Hueber & Wohlmuth 2005 (primal-dual active set); Murty 1974 (least-index pivoting);
+Hintermueller, Ito & Kunisch 2003 (the active set as a semismooth Newton method).
 """
 
 from __future__ import annotations
@@ -10,14 +11,16 @@ from enum import Enum
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import inv, solve
+from scipy.linalg import cho_factor, solve, solve_triangular
 
 from poro.compliance import Compliance
+from poro.curvature import Springs, group_springs
 from poro.levelset import LevelSet
 from poro.mesh.tetmesh import Array
 
 GAP_TOLERANCE_MM = 1e-9
-SPRING_CUT = 1e-3  # springs softer than this share of the stiffest wait for the next linearization
+QUICK_STEPS = 10  # linearizations in which the active set is exchanged once, as in a semismooth Newton method
+MAX_PIVOTS = 80  # of later ones, and of the first, which knows no active set
 MAX_MOVE_MM = 20.0  # largest step over which a linearized wall is believed
 
 
@@ -80,8 +83,8 @@ def settle(
 ) -> ContactState:
     """Contact forces that keep every node in front of the wall, for the displacements `free` (nc, 3) without any wall.
 
-    The gap is linearized where the nodes are and the linear complementarity problem solved, until no node moves by more
-    than `tolerance_mm`.
+    The gap is linearized where the nodes are and one exchange of the active set made, until no node moves by more than
+    `tolerance_mm` and the set stays; where that takes long, every linear complementarity problem is solved to its end.
     """
     u = start.u if start else np.zeros_like(free)
     active = start.active if start else np.zeros(len(free), bool)
@@ -92,55 +95,20 @@ def settle(
         gap, gradient, hessian = obstacle.gap(u, travel_mm)
         springs = group_springs(compliance, obstacle.rest, force, hessian)
         wall = Linearized(compliance, gap, gradient, u, free, springs)
-        force, active, target, used, status = complementarity(wall, active)
+        quick = len(moves) < QUICK_STEPS and (start is not None or len(moves) > 0)
+        force, active, target, used, status = complementarity(wall, active, 1 if quick else MAX_PIVOTS)
         pivots += used
-        pivoted = pivoted or status is not ContactStatus.SETTLED
+        pivoted = pivoted or status is ContactStatus.PIVOTED
         moves.append(float(np.linalg.norm(target - u, axis=1).max(initial=0)))
         u = u + min(1.0, MAX_MOVE_MM / max(moves[-1], 1e-30)) * (target - u)
-        if moves[-1] < tolerance_mm:
+        if moves[-1] < tolerance_mm and status is not ContactStatus.STOPPED:
             break
     gap, gradient, hessian = obstacle.gap(u, travel_mm)
-    if moves[-1] >= tolerance_mm:
+    if moves[-1] >= tolerance_mm or status is ContactStatus.STOPPED:
         status = ContactStatus.STOPPED
     elif pivoted and status is not ContactStatus.STOPPED:
         status = ContactStatus.PIVOTED
     return ContactState(u, force, gap, gradient, hessian, active, len(moves), pivots, tuple(moves), status)
-
-
-@dataclass(frozen=True)
-class Springs:
-    """Stiffness by which the wall's curvature turns the forces on sliding nodes, each spring on a group's mean motion.
-
-    mean: (r, nc, 3) weights of the nodes' motion in a spring's stretch; motion: (r, nc, 3) displacements under a unit
-    force of every spring; inverse: (r, r) of diag(1/d) + mean . motion for strengths d in kPa mm of either sign.
-    """
-
-    mean: Array
-    motion: Array
-    inverse: Array
-
-
-def group_springs(compliance: Compliance, points: Array, force: Array, hessian: Array) -> Springs:
-    """Springs of forces (nc,) on a wall of Hessian (nc, 3, 3): a hollow wall steadies the nodes that press on it.
-
-    Only motions as long as a group feel the curvature as much as the tissue, so groups of nodes at points (nc, 3)
-    share three springs; what they miss the next linearization makes up.
-    """
-    groups = compliance.groups(points)
-    stiff = np.zeros((len(groups.share), 3, 3))
-    np.add.at(stiff, groups.label, -force[:, None, None] * hessian)
-    values, vectors = np.linalg.eigh(stiff)
-    flat = values.ravel()
-    keep = np.abs(flat) > SPRING_CUT * np.abs(flat).max(initial=0)
-    which, along, strength = (
-        np.repeat(np.arange(len(stiff)), 3)[keep],
-        vectors.transpose(0, 2, 1).reshape(-1, 3)[keep],
-        flat[keep],
-    )
-    motion = np.einsum("rnab,rb->rna", groups.motion[which], along)
-    mean = (groups.label == which[:, None])[:, :, None] * along[:, None] * groups.share[which][:, None, None]
-    matrix = np.tensordot(mean, motion, axes=([1, 2], [1, 2])) + np.diag(1 / strength)
-    return Springs(mean, motion, inv(matrix) if len(which) else matrix)
 
 
 @dataclass(frozen=True)
@@ -157,30 +125,34 @@ class Linearized:
     springs: Springs
 
     @cached_property
-    def anchor(self) -> Array:
-        """Forces (r,) of the springs when no other contact force acts."""
-        return self.springs.inverse @ np.tensordot(self.springs.mean, self.u - self.free, axes=2)
+    def slack(self) -> Array:
+        """Stretch (r,) of the springs when no contact force acts."""
+        return self.springs.stretch(self.free - self.u)
 
     def reduced(self, pool: Array) -> tuple[Array, Array, Array]:
-        """Compliance (k, k) and gap (k,) of nodes `pool` with the springs eliminated, and how they load the springs
-        (r, k).
-        """
-        n, s = self.gradient[pool], self.springs
-        coupling = np.einsum("rkd,kd->rk", s.motion[:, pool], n)
-        matrix = self.compliance.between(pool, n, pool, n) - coupling.T @ (s.inverse @ coupling)
-        offset = self.gap[pool] + np.einsum("nd,nd->n", n, (self.free - self.u)[pool]) + coupling.T @ self.anchor
-        return matrix, offset, coupling
+        """Compliance (k, k) and gap (k,) of nodes `pool` along their normals, and how springs move them (k, r)."""
+        n = self.gradient[pool]
+        offset = self.gap[pool] + np.einsum("nd,nd->n", n, (self.free - self.u)[pool])
+        return self.compliance.between(pool, n), offset, self.springs.along_normals(pool, n)
 
-    def displacement(self, pool: Array, force: Array, coupling: Array) -> Array:
-        """Displacements (nc, 3) under normal forces (k,) at nodes `pool`, springs included."""
+    def balance(self, matrix: Array, offset: Array, coupling: Array) -> tuple[Array, Array]:
+        """Normal forces (k,) that close the gaps of all nodes of a pool, and the springs' forces (r,)."""
+        lower = cho_factor(matrix, lower=True, check_finite=False)[0]
+        sides = np.concatenate([offset[:, None], coupling], axis=1)
+        y = solve_triangular(lower, sides, lower=True, check_finite=False)
+        schur = self.springs.matrix - y[:, 1:].T @ y[:, 1:]
+        pull = solve(schur, y[:, 1:].T @ y[:, 0] - self.slack) if len(schur) else np.zeros(0)
+        return -solve_triangular(lower, y @ np.append(1, pull), lower=True, trans=1, check_finite=False), pull
+
+    def displacement(self, pool: Array, force: Array, pull: Array) -> Array:
+        """Displacements (nc, 3) under normal forces (k,) at nodes `pool` and the springs' forces (r,)."""
         total = np.zeros_like(self.u)
         total[pool] = self.gradient[pool] * force[:, None]
-        pull = self.anchor - self.springs.inverse @ (coupling @ force)
-        return self.free + self.compliance.apply(total) + np.tensordot(pull, self.springs.motion, axes=1)
+        return self.free + self.compliance.apply(total) + self.springs.motion(pull)
 
 
 def complementarity(
-    wall: Linearized, active: Array, max_pivots: int = 80
+    wall: Linearized, active: Array, max_pivots: int = MAX_PIVOTS
 ) -> tuple[Array, Array, Array, int, ContactStatus]:
     """Forces (nc,) >= 0 with linearized gap >= 0 and gap . force = 0, from a guessed active set (nc,) bool.
 
@@ -198,9 +170,8 @@ def complementarity(
             matrix, offset, coupling = wall.reduced(pool)
         within = np.searchsorted(pool, rows)
         push = np.zeros(len(pool))
-        if len(rows):
-            push[within] = -solve(matrix[np.ix_(within, within)], offset[within], assume_a="sym", check_finite=False)
-        u = wall.displacement(pool, push, coupling)
+        push[within], pull = wall.balance(matrix[np.ix_(within, within)], offset[within], coupling[within])
+        u = wall.displacement(pool, push, pull)
         force = np.zeros(len(active))
         force[pool] = push
         gap = wall.gap + np.einsum("nd,nd->n", wall.gradient, u - wall.u)
@@ -232,7 +203,7 @@ def contact_sensitivity(
     result = np.zeros_like(free)
     if len(rows) == 0:
         return result
-    matrix = compliance.between(rows, direction, rows, direction)
+    matrix = compliance.between(rows, direction)
     matrix += np.diag(np.concatenate([np.zeros(len(active)), 1 / strength]))
     drift = -(obstacle.moving[:, None] * obstacle.axis)[:, :, None] * travel
     weight = -solve(matrix, np.einsum("rd,rdk->rk", direction, (free + drift)[rows]), assume_a="sym")

@@ -9,8 +9,9 @@ import numpy as np
 from scipy.sparse import csr_matrix, diags
 
 from poro.assembly import consistent_mass, laplacian
+from poro.dissection import Tree
 from poro.mesh.tetmesh import Array, TetMesh
-from poro.solver import linear_solver
+from poro.solver import elimination_tree, linear_solver
 from poro.tissue import Tissue
 
 
@@ -38,6 +39,22 @@ class Flow:
         mass = diags(self.mesh.node_volumes).tocsr() if self.lumped else consistent_mass(self.mesh)
         return (self.tissue.mobility * laplacian(self.mesh))[self.inner], mass[self.inner]
 
+    @cached_property
+    def inner_rows(self) -> tuple[csr_matrix, csr_matrix]:
+        """Conduction and reaction among the inner nodes, (ni, ni) each."""
+        conduction, mass = self._rows
+        return conduction[:, self.inner].tocsr(), mass[:, self.inner].tocsr()
+
+    @cached_property
+    def sink(self) -> Array:
+        """Air (ni,) that unit evacuation takes from every inner node at pleural pressure."""
+        excess = self.tissue.pleural_kpa - self.tissue.bronchial_kpa
+        return np.asarray(self._rows[1].sum(axis=1)).ravel() * excess
+
+    @cached_property
+    def _tree(self) -> Tree:
+        return elimination_tree(self.inner_rows[0], self.mesh.points[self.inner])
+
     def pressure(self, kappa_b: float) -> tuple[Array, Array]:
         """Pressure (n,) kPa and its derivative (n,) by ln kappa_b; kappa_b in 1/(Pa s).
 
@@ -45,17 +62,15 @@ class Flow:
         """
         if not kappa_b >= 0:
             raise ValueError(f"kappa_b must be 0 or more, got {kappa_b}")
-        conduction, mass = self._rows
         p = np.full(len(self.mesh.points), self.tissue.pleural_kpa)
         change = np.zeros_like(p)
         if len(self.inner):
-            matrix = conduction + kappa_b * mass
-            solver = linear_solver(matrix[:, self.inner].tocsr(), self.mesh.points[self.inner])
+            conduction, mass = self.inner_rows
+            solver = linear_solver((conduction + kappa_b * mass).tocsr(), self.mesh.points[self.inner], self._tree)
             # Solved for the drop below the pleural pressure, so that no digit is lost where little air leaves.
-            excess = self.tissue.pleural_kpa - self.tissue.bronchial_kpa
-            sink = kappa_b * np.asarray(mass.sum(axis=1)).ravel() * excess
-            p[self.inner] -= solver.solve(sink)
-            change[self.inner] = solver.solve(-kappa_b * (mass @ (p - self.tissue.bronchial_kpa)))
+            drop = solver.solve(kappa_b * self.sink)
+            p[self.inner] -= drop
+            change[self.inner] = solver.solve(kappa_b * (mass @ drop - self.sink))
         return p, change
 
     def resolved(self, kappa_b: float) -> float:

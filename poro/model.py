@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from functools import cached_property
 
 import numpy as np
 
-from poro.assembly import body_load, deformation_gradient, gradient_load
+from poro.assembly import body_load, gradient_load
 from poro.compliance import Compliance
 from poro.contact import ContactState, ContactStatus, Obstacle, contact_sensitivity, settle
 from poro.flow import Flow
 from poro.levelset import level_set
 from poro.mesh.patches import patches, principal_axis
-from poro.mesh.tetmesh import Array, TetMesh
+from poro.mesh.tetmesh import Array, TetMesh, signed_volumes
 from poro.modes import LoadMode
 from poro.solid import Solid, solid, unknowns_of
+from poro.suction import Suction
 from poro.tissue import GRAVITY_KPA_PER_MM, Tissue
 
 KAPPA_B_BOUNDS = (1e-14, 1e-4)
@@ -71,7 +73,6 @@ class PoroState:
     conflicts: int
     status: PoroStatus
     contact: ContactState
-    log_pressure_change: Array
 
     @property
     def inverted_share(self) -> float:
@@ -115,6 +116,11 @@ class PoroSystem:
         force = np.stack([mode.force for mode in self.modes], axis=2)
         imposed = np.stack([mode.imposed for mode in self.modes], axis=2)[self.hilum]
         return self.solid.solve(force, imposed)
+
+    @cached_property
+    def suction(self) -> Suction:
+        """Pressure and what it does at any kappa_b."""
+        return Suction(self.flow, self.solid, self.pressure_load)
 
     @cached_property
     def pressure_load(self) -> Array:
@@ -167,34 +173,72 @@ def solve(system: PoroSystem, theta: Theta, start: PoroState | None = None, tole
 
     tolerance_mm: largest last motion of a contact node.
     """
+    p, free = without_wall(system, theta)
+    contact = _settled(system, theta, free, start.contact if start else None, tolerance_mm)
+    return _state(system, theta, p, free + system.solid.solve(_pushed(system, contact)), contact)
+
+
+def solve_many(system: PoroSystem, thetas: Sequence[Theta], tolerance_mm: float = 1e-3) -> list[PoroState]:
+    """Deflated lungs at many parameter values, each started from the nearest one that is solved already."""
+    places = np.array([[np.log10(max(t.kappa_b, KAPPA_B_BOUNDS[0])), 10 * t.phi, t.d_diaph_mm / 5] for t in thetas])
+    loads: list[tuple[Array, Array]] = [without_wall(system, theta) for theta in thetas]
+    contacts: dict[int, ContactState] = {}
+    far = np.linalg.norm(places - places.mean(axis=0), axis=1)
+    nearest = np.full(len(thetas), -1)
+    while len(contacts) < len(thetas):
+        k = int(np.argmin(far))
+        before = contacts.get(int(nearest[k]))
+        contacts[k] = _settled(system, thetas[k], loads[k][1], before, tolerance_mm)
+        away = np.linalg.norm(places - places[k], axis=1)
+        closer = (away < far) | (nearest < 0)
+        nearest[closer], far[closer] = k, away[closer]
+        far[list(contacts)] = np.inf
+    forces = np.stack([_pushed(system, contacts[k]) for k in range(len(thetas))], axis=2)
+    pushed = system.solid.solve(forces)
+    return [
+        _state(system, theta, p, free + pushed[:, :, k], contacts[k])
+        for k, (theta, (p, free)) in enumerate(zip(thetas, loads, strict=True))
+    ]
+
+
+def without_wall(system: PoroSystem, theta: Theta) -> tuple[Array, Array]:
+    """Pressure (n,) kPa, and displacements (n, 3) mm of the lung if nothing were in its way."""
     if len(theta.modes) != len(system.modes):
         raise ValueError(f"theta carries {len(theta.modes)} amplitudes, the system has {len(system.modes)} load modes")
-    p, change = system.flow.pressure(theta.kappa_b)
-    shape = system.mesh.points.shape
-    free = (
-        system.solid.solve((system.pressure_load @ p).reshape(shape))
-        + system.weight_response * system.tissue.density(theta.phi)
-        + system.hilum_response
-        + system.mode_responses @ np.array(theta.modes)
-    )
-    nodes = system.contact_nodes
-    wall = (system.compliance, system.obstacle)
-    contact = settle(*wall, free[nodes], theta.d_diaph_mm, start.contact if start else None, tolerance_mm)
-    if contact.status is ContactStatus.STOPPED:
-        # Very heavy or strongly sucked lungs slide too far for one linearization: load them in steps.
-        grown = None
-        for share in np.linspace(0.2, 1, 5):
-            grown = settle(*wall, share * free[nodes], share * theta.d_diaph_mm, grown, tolerance_mm)
-        contact = grown or contact
-    force = np.zeros(shape)
-    force[nodes] = contact.gradient * contact.force[:, None]
-    u = free + system.solid.solve(force)
-    det_f = np.linalg.det(deformation_gradient(system.mesh, u))
+    sucked = system.suction.at(theta.kappa_b)
+    by_weight = system.weight_response * system.tissue.density(theta.phi)
+    return sucked.p, sucked.u + by_weight + system.hilum_response + system.mode_responses @ np.array(theta.modes)
+
+
+def _settled(
+    system: PoroSystem, theta: Theta, free: Array, start: ContactState | None, tolerance_mm: float
+) -> ContactState:
+    wall, there = (system.compliance, system.obstacle), free[system.contact_nodes]
+    contact = settle(*wall, there, theta.d_diaph_mm, start, tolerance_mm)
+    if contact.status is not ContactStatus.STOPPED:
+        return contact
+    # Very heavy or strongly sucked lungs slide too far for one linearization: load them in steps.
+    grown = None
+    for share in np.linspace(0.2, 1, 5):
+        grown = settle(*wall, share * there, share * theta.d_diaph_mm, grown, tolerance_mm)
+    return grown or contact
+
+
+def _pushed(system: PoroSystem, contact: ContactState) -> Array:
+    """Nodal forces (n, 3) of the wall."""
+    force = np.zeros_like(system.mesh.points)
+    force[system.contact_nodes] = contact.gradient * contact.force[:, None]
+    return force
+
+
+def _state(system: PoroSystem, theta: Theta, p: Array, u: Array, contact: ContactState) -> PoroState:
+    nodes, boundary = system.contact_nodes, system.mesh.boundary
+    det_f = signed_volumes(system.mesh.points + u, system.mesh.tets) / system.mesh.volumes
     gap = np.full(len(u), np.inf)
     gap[nodes] = contact.gap
-    pressure = np.zeros(len(u))
     area = np.zeros(len(u))
-    area[system.mesh.boundary.nodes] = system.mesh.boundary.node_areas
+    area[boundary.nodes] = boundary.node_areas
+    pressure = np.zeros(len(u))
     pressure[nodes] = contact.force * np.linalg.norm(contact.gradient, axis=1) / area[nodes]
     active = np.zeros(len(u), bool)
     active[nodes] = contact.active
@@ -203,15 +247,15 @@ def solve(system: PoroSystem, theta: Theta, start: PoroState | None = None, tole
     status = PoroStatus.INVERTED if (det_f <= 0).any() else PoroStatus.SOLVED
     if contact.status is ContactStatus.STOPPED:
         status = PoroStatus.NOT_SETTLED
-    return PoroState(theta, u, p, pressure, det_f, gap, active, contact.steps, conflicts, status, contact, change)
+    return PoroState(theta, u, p, pressure, det_f, gap, active, contact.steps, conflicts, status, contact)
 
 
 def sensitivity(system: PoroSystem, state: PoroState) -> Array:
     """Derivatives of u by the entries of Theta.vector(), (n, 3, 3 + k), at the state's active set."""
     n = len(system.mesh.points)
-    pressure_force = (system.pressure_load @ state.log_pressure_change).reshape(n, 3) * np.log(10)
+    by_log_kappa = system.suction.at(state.theta.kappa_b).u_change * np.log(10)
     by_phi = system.weight_response * (system.tissue.density_fluid - system.tissue.density_solid)
-    parts = [system.solid.solve(pressure_force), by_phi, np.zeros((n, 3))]
+    parts = [by_log_kappa, by_phi, np.zeros((n, 3))]
     free = np.concatenate([np.stack(parts, axis=2), system.mode_responses], axis=2)
     travel = np.zeros(free.shape[2])
     travel[2] = 1

@@ -11,8 +11,8 @@ import numpy as np
 import pyamg
 from scipy.sparse import bsr_matrix, csr_matrix
 
-from poro.cholesky import cholesky
-from poro.dissection import dissect
+from poro.cholesky import Cholesky, cholesky
+from poro.dissection import Tree, dissect
 from poro.mesh.tetmesh import Array
 
 # Numbers in a factor above which memory (8 bytes each) decides for the iterative solver.
@@ -63,10 +63,21 @@ def rigid_modes(points: Array) -> Array:
     return modes.reshape(-1, 6)
 
 
-def linear_solver(matrix: csr_matrix, points: Array, limit: int = FACTOR_LIMIT) -> LinearSolver:
-    """Solver of a symmetric positive definite matrix with 1 or 3 unknowns at each of points (n, 3); chosen by size."""
+def elimination_tree(matrix: csr_matrix, points: Array) -> Tree:
+    """Order in which a matrix with 1 or 3 unknowns at each of points (n, 3) is eliminated."""
     block = matrix.shape[0] // len(points)
-    tree = dissect(_node_graph(matrix, block), points, 96 if block == 1 else 40)
+    return dissect(_node_graph(matrix, block), points, 96 if block == 1 else 40)
+
+
+def linear_solver(
+    matrix: csr_matrix, points: Array, tree: Tree | None = None, limit: int = FACTOR_LIMIT
+) -> LinearSolver:
+    """Solver of a symmetric positive definite matrix with 1 or 3 unknowns at each of points (n, 3); chosen by size.
+
+    tree: of an earlier matrix with the same entries, to save its making.
+    """
+    block = matrix.shape[0] // len(points)
+    tree = tree or elimination_tree(matrix, points)
     if tree.factor_entries(block) <= limit:
         return cholesky(matrix, tree, block)
     near_null = rigid_modes(points) if block == 3 else np.ones((len(points), 1))
@@ -75,6 +86,19 @@ def linear_solver(matrix: csr_matrix, points: Array, limit: int = FACTOR_LIMIT) 
         blocked, B=near_null, strength=("symmetric", {"theta": 0.0}), max_coarse=300
     )
     return Multigrid(blocked, hierarchy)
+
+
+def inverse_at(solver: LinearSolver, unknowns: Array, size: int, dtype: type, batch: int = 384) -> Array:
+    """Rows and columns (k, k) of type `dtype` of the inverse of a matrix of `size` unknowns at distinct ones (k,)."""
+    if isinstance(solver, Cholesky):
+        return solver.inverse_at(unknowns, dtype)
+    result: Array = np.empty((len(unknowns), len(unknowns)), dtype)
+    for first in range(0, len(unknowns), batch):
+        chunk = unknowns[first : first + batch]
+        right = np.zeros((size, len(chunk)))
+        right[chunk, np.arange(len(chunk))] = 1
+        result[:, first : first + batch] = solver.solve(right)[unknowns]
+    return result
 
 
 def _node_graph(matrix: csr_matrix, block: int) -> csr_matrix:

@@ -15,11 +15,11 @@ from poro.contact import (
     ContactStatus,
     Linearized,
     Obstacle,
-    Springs,
     complementarity,
     contact_sensitivity,
     settle,
 )
+from poro.curvature import Springs, group_springs
 from poro.levelset import LevelSet, level_set
 from poro.mesh.tetmesh import Array, TetMesh
 from poro.solid import Solid, solid
@@ -77,10 +77,15 @@ class _Dense(Compliance):
     def __init__(self, matrix: Array) -> None:
         n = len(matrix) // 3
         super().__init__(self, np.arange(3 * n).reshape(-1, 3), 3 * n)
-        self.matrix = matrix
+        self.dense = matrix
 
     def solve(self, right: Array) -> Array:
-        return self.matrix @ right
+        return self.dense @ right
+
+
+def _no_springs(compliance: Compliance, nodes: int) -> Springs:
+    """Springs of a flat wall, that is none."""
+    return group_springs(compliance, np.arange(3.0 * nodes).reshape(-1, 3), np.zeros(nodes), np.zeros((nodes, 3, 3)))
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -92,8 +97,8 @@ def test_active_set_equals_a_quadratic_program(seed: int) -> None:
     gradient = rng.normal(size=(n, 3))
     gradient /= np.linalg.norm(gradient, axis=1)[:, None]
     free = rng.normal(size=(n, 3))
-    none = Springs(np.zeros((0, n, 3)), np.zeros((0, n, 3)), np.zeros((0, 0)))
-    wall = Linearized(_Dense(dense), np.zeros(n), gradient, np.zeros((n, 3)), free, none)
+    compliance = _Dense(dense)
+    wall = Linearized(compliance, np.zeros(n), gradient, np.zeros((n, 3)), free, _no_springs(compliance, n))
     force, active, u, _, _ = complementarity(wall, rng.random(n) < 0.5)
     rows = np.zeros((3 * n, n))
     rows[np.arange(3 * n), np.repeat(np.arange(n), 3)] = gradient.ravel()
@@ -109,10 +114,9 @@ def _signorini(dense: Array, load: Array) -> tuple[Array, ContactStatus]:
     """Forces (n,) of n one-way contacts of compliance dense (n, n) and free gaps `load` (n,), from none active."""
     n = len(load)
     full = np.kron(dense, np.diag([1.0, 0, 0])) + np.diag(np.tile([0, 1.0, 1.0], n))
-    none = Springs(np.zeros((0, n, 3)), np.zeros((0, n, 3)), np.zeros((0, 0)))
-    wall = Linearized(
-        _Dense(full), load, np.broadcast_to([1.0, 0, 0], (n, 3)).copy(), np.zeros((n, 3)), np.zeros((n, 3)), none
-    )
+    compliance = _Dense(full)
+    zero, along = np.zeros((n, 3)), np.broadcast_to([1.0, 0, 0], (n, 3)).copy()
+    wall = Linearized(compliance, load, along, zero, zero, _no_springs(compliance, n))
     force, _, _, _, status = complementarity(wall, np.zeros(n, bool))
     return force, status
 

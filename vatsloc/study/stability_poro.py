@@ -15,10 +15,9 @@ from poro.choice import finite_problem
 from poro.finite import deform
 from poro.flow import Flow
 from poro.laws import neo_hookean
-from poro.model import PoroSystem, Theta, solve
+from poro.model import PoroSystem, Theta, solve, without_wall
 from poro.solid import solid
 from poro.tissue import GRAVITY_KPA_PER_MM, Tissue
-from vatsloc.study.bench_poro import free_displacement
 from vatsloc.study.poro_lung import in_smooth_wall, lung, system_of
 
 Row = dict[str, Any]
@@ -76,7 +75,7 @@ def towards_incompressible() -> list[Row]:
     for poisson in (0.35, 0.45, 0.49, 0.499, 0.4999):
         row: Row = {"poisson": poisson}
         for tets in (3_000, 24_000):
-            u = free_displacement(_system(tets, Tissue(poisson=poisson)), Theta(0.0, 0.7))
+            u = without_wall(_system(tets, Tissue(poisson=poisson)), Theta(0.0, 0.7))[1]
             row[f"mean_mm_{tets}"] = float(np.linalg.norm(u, axis=1).mean())
         rows.append(row)
     return rows
@@ -144,7 +143,7 @@ def small_hila() -> list[Row]:
     for radius in (40.0, 30.0, 22.0, 18.0):
         system = _system(8_000, hilum_radius_mm=radius)
         state = solve(system, Theta(1e-9, 0.6))
-        free = free_displacement(system, Theta(1e-9, 0.6))
+        free = without_wall(system, Theta(1e-9, 0.6))[1]
         rows.append(
             {
                 "hilum_radius_mm": radius,

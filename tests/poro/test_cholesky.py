@@ -1,0 +1,53 @@
+"""The inverse at chosen unknowns against dense algebra, for every solver, and contact on it in single precision."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from shapes import compliance_of, ellipsoid
+
+import poro.compliance
+from poro.assembly import body_load, stiffness
+from poro.contact import Obstacle, settle
+from poro.levelset import level_set
+from poro.solid import solid, unknowns_of
+from poro.solver import inverse_at, linear_solver
+from poro.tissue import GRAVITY_KPA_PER_MM, Tissue
+
+
+@pytest.mark.parametrize(("limit", "tolerance"), [(10**9, 1e-11), (0, 1e-8)])
+def test_inverse_at_chosen_unknowns(limit: int, tolerance: float) -> None:
+    mesh, tissue = ellipsoid(22.0), Tissue()
+    free = np.setdiff1d(np.arange(len(mesh.points)), np.flatnonzero(mesh.points[:, 2] < -40))
+    rows = unknowns_of(free)
+    matrix = stiffness(mesh, tissue.lame_kpa, tissue.shear_kpa)[rows][:, rows].tocsr()
+    solver = linear_solver(matrix, mesh.points[free], limit=limit)
+    chosen = np.random.default_rng(2).permutation(len(rows))[:200]
+    expected = np.linalg.inv(matrix.toarray())[np.ix_(chosen, chosen)]
+    scale = np.abs(expected).max()
+    assert_allclose(inverse_at(solver, chosen, len(rows), np.float64), expected, atol=tolerance * scale)
+    single = inverse_at(solver, chosen, len(rows), np.float32)
+    assert single.dtype == np.float32
+    assert_allclose(single, expected, atol=2e-6 * scale)
+
+
+def test_contact_in_single_precision_moves_nodes_by_less_than_a_micron(monkeypatch: pytest.MonkeyPatch) -> None:
+    mesh = ellipsoid(16.0)
+    held = np.flatnonzero(np.linalg.norm(mesh.points - [-30, 0, 0], axis=1) < 16)
+    body = solid(mesh, Tissue(), held)
+    nodes = np.setdiff1d(mesh.boundary.nodes, held)
+    level, rest = level_set(mesh.boundary, 6.0, 10.0), mesh.points[nodes]
+    still = np.zeros(len(nodes), bool)
+    obstacle = Obstacle(level, rest, still, np.array([0, 0, 1.0]), np.minimum(level.evaluate(rest)[0], 0))
+    free = body.solve(body_load(mesh, np.array([0.6, 0, -0.8]) * 200 * GRAVITY_KPA_PER_MM))[nodes]
+    states = []
+    for double in (10**6, 0):
+        monkeypatch.setattr(poro.compliance, "DOUBLE_UNKNOWNS", double)
+        compliance = compliance_of(body, nodes)
+        states.append(settle(compliance, obstacle, free, 0.0, tolerance_mm=1e-6))
+        assert compliance.matrix.dtype == (np.float64 if double else np.float32)
+    exact, single = states
+    assert exact.active.sum() > 20
+    assert (exact.active == single.active).all()
+    assert 0 < np.abs(exact.u - single.u).max() < 1e-3

@@ -1,0 +1,57 @@
+"""The reduced basis of pressures against whole solutions, and many lungs against one at a time."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from shapes import ellipsoid
+
+from poro.model import PoroStatus, PoroSystem, Theta, assemble, solve, solve_many
+from poro.tissue import Tissue
+
+
+@pytest.fixture(scope="module")
+def system() -> PoroSystem:
+    mesh = ellipsoid(14.0)
+    held = np.flatnonzero(np.linalg.norm(mesh.points - [-30, 0, 0], axis=1) < 16)
+    return assemble(mesh, Tissue(), np.array([-1.0, 0, 0]), held, np.broadcast_to([1.0, 0, 2.0], (len(held), 3)))
+
+
+def test_basis_gives_whole_solutions_and_stops_growing(system: PoroSystem) -> None:
+    suction, flow = system.suction, system.flow
+    for kappa_b in np.geomspace(1e-14, 1e-4, 30):
+        suction.at(kappa_b)
+    known = suction.size
+    assert known < 60
+    for kappa_b in 10 ** np.random.default_rng(0).uniform(-13, -5, 12):
+        found = suction.at(kappa_b)
+        p, change = flow.pressure(kappa_b)
+        drop = np.abs(p - system.tissue.pleural_kpa).max()
+        assert_allclose(found.p, p, atol=1e-8 * drop)
+        assert_allclose(found.p_change, change, atol=1e-8 * drop)
+        u = system.solid.solve((system.pressure_load @ p).reshape(-1, 3))
+        assert_allclose(found.u, u, atol=1e-7 * np.abs(u).max())
+        du = system.solid.solve((system.pressure_load @ change).reshape(-1, 3))
+        assert_allclose(found.u_change, du, atol=1e-7 * np.abs(u).max())
+    assert suction.size - known < 12
+
+
+def test_no_evacuation_sucks_nothing(system: PoroSystem) -> None:
+    still = system.suction.at(0.0)
+    assert_allclose(still.p, system.tissue.pleural_kpa, rtol=1e-14)
+    assert_allclose(still.u, 0, atol=1e-12)
+    with pytest.raises(ValueError, match="kappa_b must be 0 or more"):
+        system.suction.at(-1e-9)
+
+
+def test_many_lungs_equal_lungs_one_by_one(system: PoroSystem) -> None:
+    rng = np.random.default_rng(1)
+    thetas = [Theta(10 ** rng.uniform(-10, -7.5), rng.uniform(0.7, 0.9), rng.uniform(0, 8)) for _ in range(6)]
+    for theta, state in zip(thetas, solve_many(system, thetas, 1e-7), strict=True):
+        alone = solve(system, theta, tolerance_mm=1e-7)
+        assert state.status is PoroStatus.SOLVED
+        assert state.theta is theta
+        assert_allclose(state.u, alone.u, atol=1e-5)
+        assert_allclose(state.p, alone.p, atol=1e-9)
+        assert (state.active == alone.active).all()
