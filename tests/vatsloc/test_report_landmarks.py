@@ -6,7 +6,7 @@ import numpy as np
 from numpy.testing import assert_allclose
 
 from vatsloc.formats.meshes import Surface
-from vatsloc.report.landmarks import depth_below, surface_landmarks
+from vatsloc.report.landmarks import depth_below, moved_by, surface_landmarks
 
 CORNERS = np.array([[x, y, z] for x in (-1.0, 1) for y in (-1.0, 1) for z in (-1.0, 1)])
 QUADS = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
@@ -42,3 +42,11 @@ def test_nearest_edge_comes_first_and_those_at_the_wall_are_not_visible():
     assert away == sorted(away)
     for mark in marks.values():
         assert_allclose(mark.away_mm, np.linalg.norm(mark.at_ras - foot))
+
+
+def test_motion_is_told_by_value_and_sign_the_longest_way_first() -> None:
+    assert moved_by(np.zeros(3), np.array([-22.0, 0.2, 5.1])) == "23 mm: 22 to the left, 5 to the head"
+    assert (
+        moved_by(np.array([1.0, 2, 3]), np.array([3.0, -7, 0])) == "10 mm: 9 to the back, 3 to the feet, 2 to the right"
+    )
+    assert moved_by(np.ones(3), np.ones(3)) == "0 mm"

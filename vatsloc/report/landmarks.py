@@ -46,5 +46,18 @@ def surface_landmarks(lung: Surface, cage: Surface, foot_ras: Array) -> tuple[La
     return tuple(sorted(marks, key=lambda mark: mark.away_mm))
 
 
+def moved_by(before_ras: Array, after_ras: Array) -> str:
+    """How far a point (3,) mm has moved and where to, the longest way first, in a body's own words."""
+    ways = (("right", "left"), ("front", "back"), ("head", "feet"))
+    step = np.asarray(after_ras) - np.asarray(before_ras)
+    parts = [
+        f"{abs(step[axis]):.0f} to the {ways[axis][int(step[axis] < 0)]}"
+        for axis in np.argsort(-np.abs(step))
+        if abs(step[axis]) >= 0.5
+    ]
+    told = f"{np.linalg.norm(step):.0f} mm"
+    return f"{told}: {', '.join(parts)}" if parts else told
+
+
 def _tri(surface: Surface) -> TriSurface:
     return TriSurface(surface.points_ras, surface.triangles, np.arange(len(surface.points_ras)))

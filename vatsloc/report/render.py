@@ -16,6 +16,7 @@ from registration.volume import Array, Grid
 from vatsloc.frames import flip_points
 from vatsloc.report.charts import bars, box_plot
 from vatsloc.report.data import LUNG, MESH, NODULE, SURFACE, Comparison, Picture, ReportData, TreSection
+from vatsloc.report.landmarks import moved_by
 from vatsloc.report.paint import as_bgr, draw_nodule, draw_outline, green_magenta, grey, jpeg
 from vatsloc.report.planes import AXES, EDGE_LETTERS, Plane, box_of, plane_through, sample
 from vatsloc.report.scene import scene
@@ -82,6 +83,7 @@ def render(data: ReportData) -> str:
         semi_axes=_semi_axes(data),
         viewer=viewer,
         scene_json=_script_json(scene(data, viewer)),
+        moved=None if data.motion is None else moved_by(data.motion.nodule_before, data.nodule.centre_ras),
         mark=next((mark for mark in data.landmarks if mark.visible), None),
         phases=[(phase, _before_after(phase, data.window_hu)) for phase in data.phases],
         pictures=[(picture, _views(picture, data.window_hu)) for picture in data.pictures],
