@@ -132,9 +132,13 @@ def test_a_finished_sweep_is_read_and_not_run_again(monkeypatch: pytest.MonkeyPa
 
 
 @pytest.mark.skipif(elastix_version() is None, reason="itk-elastix is not installed")
-def test_elastix_finds_a_known_shift_by_value_and_sign(images: Images) -> None:
+def test_elastix_finds_a_known_shift_by_value_and_sign(
+    images: Images, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
     settings = ElastixSettings(grid_mm=24.0, levels=1, iterations=100, samples=1000)
     run = isolated(run_elastix, images.fixed, blobs((4, -3, 2)), images.usable, settings)
     middle = images.fixed.grid.to_ras(np.array([[18.0, 20.0, 16.0]]))
     np.testing.assert_allclose(run.moving_from_fixed.displacement(middle)[0], [4, -3, 2], atol=0.4)
     assert run.moving_from_fixed.grid.same_as(images.fixed.grid)
+    assert not list(tmp_path.iterdir())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -71,7 +72,10 @@ def run_elastix(fixed: Volume, moving: Volume, fixed_mask: Mask, settings: Elast
         run.SetLogToConsole(False)
         run.SetNumberOfThreads(THREADS)
         run.UpdateLargestPossibleRegion()
-    field = itk.transformix_deformation_field(images[1], run.GetTransformParameterObject())
+    with TemporaryDirectory() as scratch:  # it writes the field to a file as well
+        field = itk.transformix_deformation_field(
+            images[1], run.GetTransformParameterObject(), output_directory=scratch
+        )
     vectors = np.moveaxis(itk.array_from_image(field), (2, 1, 0), (0, 1, 2))
     found = DisplacementField(np.ascontiguousarray(flip_field(vectors)), fixed.ras_from_ijk)
     return ElastixRun(found, stages.seconds["elastix"], stages.peak_mb["elastix"])
