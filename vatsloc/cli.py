@@ -163,9 +163,10 @@ def chart(
 ) -> None:
     """Errors against seconds of the method's variants over CASES; goes on where it was stopped (extra "report")."""
     from vatsloc.study.chart import run_chart
-    from vatsloc.study.chart_draw import write_chart
+    from vatsloc.study.chart_draw import require_matplotlib, write_chart
     from vatsloc.study.chart_variants import VARIANTS, chosen_variants
 
+    require_matplotlib()
     chosen = chosen_variants([name.strip() for name in variants.split(",")] if variants else None)
     write_chart(run_chart(cases, chosen, out, say), VARIANTS, out, clock)
     print(out / "chart.html")

@@ -25,7 +25,7 @@ from vatsloc.errors import CaseError, InputRefused
 from vatsloc.study import chart
 from vatsloc.study.affine import affine_to_points
 from vatsloc.study.chart import Row, append_row, measure_case, read_rows, run_chart
-from vatsloc.study.chart_draw import interactive, page, write_chart
+from vatsloc.study.chart_draw import interactive, page, require_matplotlib, write_chart
 from vatsloc.study.chart_points import dominating, points_of, told_of_presets
 from vatsloc.study.chart_variants import VARIANTS, chosen_variants, masked_only, plain
 from vatsloc.workflow.stages import Stages
@@ -250,6 +250,13 @@ def test_the_chart_s_files_hold_its_numbers(tmp_path: Path) -> None:
     text = page(ROWS, points_of(ROWS, VARIANTS))
     assert "| fast | preset fast | 0.90 | 2.20 | 24.0 | 2 | mean, 95 % |" in text
     assert "- alone on b: the contact did not settle" in text
+
+
+def test_without_matplotlib_nothing_is_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    require_matplotlib()
+    monkeypatch.setattr("vatsloc.study.chart_draw.find_spec", lambda _name: None)
+    with pytest.raises(CaseError, match="matplotlib is not installed"):
+        require_matplotlib()
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")

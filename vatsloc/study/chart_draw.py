@@ -6,11 +6,13 @@ import csv
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import jinja2
 
+from vatsloc.errors import CaseError
 from vatsloc.study.chart import PHASES, Row
 from vatsloc.study.chart_points import (
     CLOCKS,
@@ -21,20 +23,11 @@ from vatsloc.study.chart_points import (
     points_of,
     told_of_presets,
 )
-from vatsloc.study.chart_variants import PRESET_NAMES, Variant
+from vatsloc.study.chart_variants import Variant
+from vatsloc.workflow.settings import PRESETS
 
 BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#8a929c"
-TICKS_S = {
-    1: "1 s",
-    3: "3 s",
-    10: "10 s",
-    30: "30 s",
-    60: "1 min",
-    300: "5 min",
-    900: "15 min",
-    3600: "1 h",
-    14400: "4 h",
-}
+TICKS_S = {1: "1 s", 3: "3 s", 10: "10 s", 30: "30 s", 120: "2 min", 600: "10 min", 3600: "1 h", 14400: "4 h"}
 TICKS_MM = (0.2, 0.5, 1, 2, 5, 10, 20, 50)
 
 
@@ -45,6 +38,12 @@ def write_chart(rows: Sequence[Row], variants: Mapping[str, Variant], out: Path,
     (out / "chart.md").write_text(page(rows, points, clock), encoding="utf-8")
     (out / "chart.html").write_text(interactive(rows, variants, clock), encoding="utf-8")
     draw(points, [out / "chart.png", out / "chart.svg"], clock)
+
+
+def require_matplotlib() -> None:
+    """Raise CaseError where figures cannot be drawn: better before long runs than after them."""
+    if find_spec("matplotlib") is None:
+        raise CaseError('matplotlib is not installed; get it by pip install "vatsloc[report]", or ".[report]" here.')
 
 
 def write_table(points: Sequence[Point], path: Path) -> None:
@@ -87,7 +86,7 @@ def interactive(rows: Sequence[Row], variants: Mapping[str, Variant], clock: str
         "measures": MEASURES,
         "sets": {name: [asdict(p) for p in points] for name, points in sets.items()},
         "published": [asdict(p) for p in PUBLISHED],
-        "presets": PRESET_NAMES,
+        "presets": tuple(PRESETS),
         "ticks": {"s": TICKS_S, "mm": TICKS_MM},
     }
     environment = jinja2.Environment(loader=jinja2.PackageLoader("vatsloc.study", "."), autoescape=True)
@@ -118,7 +117,7 @@ def _panel(axes: Any, panel: Sequence[Point], phase: str, measure: str) -> None:
     front = sorted((p for p in panel if measure in p.front), key=lambda p: p.seconds)
     axes.step([p.seconds for p in front], [getattr(p, measure) for p in front], where="post", color=BLUE, lw=1.2)
     for p in panel:
-        preset, leading = p.variant in PRESET_NAMES, measure in p.front
+        preset, leading = p.variant in PRESETS, measure in p.front
         colour = ORANGE if preset else BLUE if leading else GREY
         face = colour if p.complete else "none"
         axes.plot(p.seconds, getattr(p, measure), "D" if preset else "o", color=colour, mfc=face, ms=8 if preset else 6)
@@ -143,14 +142,14 @@ def _panel(axes: Any, panel: Sequence[Point], phase: str, measure: str) -> None:
 def _names(axes: Any, panel: Sequence[Point], measure: str) -> None:
     """A name beside every point, the front's and the presets' first, moved down or up where another one stands."""
     taken: list[tuple[float, float]] = []
-    important = sorted(panel, key=lambda p: (p.variant not in PRESET_NAMES, measure not in p.front))
+    important = sorted(panel, key=lambda p: (p.variant not in PRESETS, measure not in p.front))
     for p in important:
         x, y = axes.transData.transform((p.seconds, getattr(p, measure))) * 72 / axes.figure.dpi
-        for dy in (-3, 6, -12, 15, -21, 24, -30, 33, -39):
+        for dy in (3, -10, 12, -19, 21, -28, 30, -37, 39):
             if all(abs(y + dy - other) > 8.5 or abs(x - where) > 75 for where, other in taken):
                 break
         taken.append((x, y + dy))
-        colour = ORANGE if p.variant in PRESET_NAMES else "#1b1f24" if measure in p.front else GREY
+        colour = ORANGE if p.variant in PRESETS else "#1b1f24" if measure in p.front else GREY
         _label(axes, p.variant, (p.seconds, getattr(p, measure)), colour, (8, dy), "left")
 
 

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from statistics import fmean, median
 
 from vatsloc.study.chart import PHASES, Row
-from vatsloc.study.chart_variants import PANELS, PRESET_NAMES, Variant
+from vatsloc.study.chart_variants import PANELS, Variant
+from vatsloc.workflow.settings import PRESETS
 
 PHASE_TITLES = {
     "phase1": "Phase 1: CT to inflated",
@@ -103,7 +104,7 @@ def told_of_presets(points: Sequence[Point]) -> list[str]:
     """A sentence per preset and panel: on the front, or which point beats it."""
     told = []
     for point in points:
-        if point.variant not in PRESET_NAMES:
+        if point.variant not in PRESETS:
             continue
         head = f"{point.variant}, {PHASE_TITLES[point.phase]}:"
         for measure, name in MEASURES.items():

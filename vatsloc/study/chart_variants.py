@@ -17,7 +17,7 @@ from registration.volume import Mask, Volume
 from vatsloc.errors import CaseError
 from vatsloc.study.elastix import ElastixSettings, run_elastix
 from vatsloc.workflow.pose import Register
-from vatsloc.workflow.settings import Settings, settings_of
+from vatsloc.workflow.settings import PRESETS, Settings, settings_of
 
 PEER_VOXEL_MM = 1.5
 
@@ -125,12 +125,9 @@ VARIANTS: dict[str, Variant] = {
     "no-diaphragm-alone": _model(
         "diaphragm held still, without residual registration", residual=False, diaphragm=False
     ),
-    "fast": Variant("preset fast", Scored.ALL, preset="fast"),
-    "balanced": Variant("preset balanced", Scored.ALL),
+    **{name: Variant(f"preset {name}", Scored.ALL, preset=name) for name in PRESETS},
 }
 """Every variant by name. The order is that of their runs."""
-
-PRESET_NAMES = ("fast", "balanced")
 
 
 def chosen_variants(names: Sequence[str] | None) -> dict[str, Variant]:
