@@ -6,7 +6,8 @@ Unknowns of displacement are numbered 3 * node + axis. Ref: Alvarez 2021, eqs. 2
 from __future__ import annotations
 
 import numpy as np
-from scipy.sparse import coo_matrix, csr_matrix
+from numba import njit
+from scipy.sparse import bsr_matrix, coo_matrix, csr_matrix
 
 from poro.mesh.tetmesh import Array, TetMesh
 
@@ -14,10 +15,22 @@ from poro.mesh.tetmesh import Array, TetMesh
 def _scatter(mesh: TetMesh, local: Array, rows: int, columns: int) -> csr_matrix:
     """Sum element blocks (m, 4 * rows, 4 * columns) into a sparse matrix (n * rows, n * columns)."""
     m, n = len(mesh.tets), len(mesh.points)
-    i = (mesh.tets[:, :, None] * rows + np.arange(rows)).reshape(m, -1, 1)
-    j = (mesh.tets[:, :, None] * columns + np.arange(columns)).reshape(m, 1, -1)
-    i, j = np.broadcast_arrays(i, j)
-    return coo_matrix((local.ravel(), (i.ravel(), j.ravel())), shape=(n * rows, n * columns)).tocsr()
+    i, j = np.broadcast_arrays(mesh.tets[:, :, None], mesh.tets[:, None, :])
+    graph = coo_matrix((np.ones(16 * m), (i.ravel(), j.ravel())), shape=(n, n)).tocsr()
+    blocks = np.zeros((graph.nnz, rows, columns))
+    tets = np.asarray(mesh.tets, np.int64)
+    _add_blocks(blocks, graph.indptr, graph.indices, tets, local.reshape(m, 4, rows, 4, columns))
+    return bsr_matrix((blocks, graph.indices, graph.indptr), shape=(n * rows, n * columns)).tocsr()
+
+
+@njit(cache=True)
+def _add_blocks(blocks: Array, indptr: Array, indices: Array, tets: Array, local: Array) -> None:
+    for t in range(len(tets)):
+        for a in range(4):
+            row = tets[t, a]
+            neighbours = indices[indptr[row] : indptr[row + 1]]
+            for b in range(4):
+                blocks[indptr[row] + np.searchsorted(neighbours, tets[t, b])] += local[t, a, :, b]
 
 
 def stiffness(mesh: TetMesh, lame: float | Array, shear: float | Array) -> csr_matrix:

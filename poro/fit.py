@@ -26,6 +26,8 @@ from poro.observations import Observer, Residuals, Target, independence
 CHI2_95_3D = 7.814728  # 95 % quantile of chi-squared with three degrees of freedom
 # Longest step in (log10 kappa_b, phi, d_diaph_mm): beyond it the contact seen from here says nothing.
 REACH = np.array([1.0, 0.2, 8.0])
+DAMPING = 1e-6  # of the normal equations' diagonal, against directions that no datum sees
+SMALLEST = 1e-3  # share of the reach at which a refused step ends the descent
 
 
 @dataclass(frozen=True)
@@ -59,10 +61,10 @@ class FitStatus(Enum):
 
 @dataclass(frozen=True)
 class FitStep:
-    """One accepted or refused trial: cost, damping, theta as a vector."""
+    """One accepted or refused trial: cost, share of the reach that it was allowed, theta as a vector."""
 
     cost: float
-    damping: float
+    radius: float
     theta: Array
     accepted: bool
 
@@ -101,7 +103,7 @@ class _Problem:
 
     def cost(self, rows: Residuals, whitening: Array, theta: Array) -> float:
         """Half the robust sum of squares plus the modes' prior."""
-        return float(self._loss(rows, whitening).sum() + 0.5 * np.sum((theta[3:] / self._sigmas) ** 2))
+        return float(self._loss(rows, whitening).sum() + 0.5 * np.sum((theta[3:] / self.mode_sigmas) ** 2))
 
     def influence(self, rows: Residuals) -> Array:
         """Weight (r,) of every row by the Cauchy loss of its observation."""
@@ -120,12 +122,13 @@ class _Problem:
         return 0.5 * trust * (c**2 * np.log1p(square / c**2) if np.isfinite(c) else square)
 
     @property
-    def _sigmas(self) -> Array:
+    def mode_sigmas(self) -> Array:
+        """Prior standard deviations (k,) of the modes' amplitudes."""
         return np.array([mode.sigma for mode in self.system.modes])
 
     def prior(self) -> Array:
         """Diagonal (3 + k,) of the prior's inverse covariance."""
-        return np.concatenate([np.zeros(3), self._sigmas**-2.0])
+        return np.concatenate([np.zeros(3), self.mode_sigmas**-2.0])
 
 
 def bounds(system: PoroSystem) -> tuple[Array, Array]:
@@ -194,61 +197,57 @@ def ellipsoid95(
 
 
 def _descend(problem: _Problem, theta: Array) -> tuple[Array, PoroState, tuple[FitStep, ...], bool]:
-    """Levenberg-Marquardt with projection onto the bounds; weights are frozen at every accepted state."""
+    """Gauss-Newton in a box that shrinks when a step is refused; weights are frozen at every accepted state.
+
+    Ref: Conn, Gould & Toint 2000 (trust regions).
+    """
     low, high = bounds(problem.system)
     free = np.ones(len(theta), bool) if problem.settings.free is None else np.array(problem.settings.free)
+    reach = np.concatenate([REACH, 3 * problem.mode_sigmas])
     theta = np.clip(theta, low, high)
     state = solve(problem.system, Theta.of(theta))
     rows = problem.observer.residuals(state.u)
-    whitening = problem.whiten(rows)
-    cost = problem.cost(rows, whitening, theta)
-    damping = 1e-2
-    history = [FitStep(cost, damping, theta, True)]
-    normal, slope = _normal_equations(problem, rows, whitening, sensitivity(problem.system, state), theta)
+    cost = problem.cost(rows, problem.whiten(rows), theta)
+    radius = 1.0
+    history = [FitStep(cost, radius, theta, True)]
+    normal, slope = _normal_equations(problem, rows, sensitivity(problem.system, state), theta)
     for _ in range(problem.settings.max_steps):
-        reach = np.concatenate([REACH, np.full(len(theta) - 3, np.inf)])
-        near = np.maximum(low, theta - reach), np.minimum(high, theta + reach)
-        step = _bounded_step(normal, slope, damping, theta, *near, free)
+        near = np.maximum(low, theta - radius * reach), np.minimum(high, theta + radius * reach)
+        step = _bounded_step(normal, slope, theta, *near, free)
         if not step.any():
             return theta, state, tuple(history), True
         trial_state = solve(problem.system, Theta.of(theta + step), state)
         trial_rows = problem.observer.residuals(trial_state.u)
         trial_cost = problem.cost(trial_rows, problem.whiten(trial_rows), theta + step)
         accepted = trial_cost < cost and trial_state.status is not PoroStatus.NOT_SETTLED
-        history.append(FitStep(trial_cost if accepted else cost, damping, theta + step, accepted))
+        history.append(FitStep(trial_cost if accepted else cost, radius, theta + step, accepted))
         if not accepted:
-            damping *= 10
-            if damping > 1e6:
+            radius = 0.3 * min(radius, float(np.abs(step / reach).max()))
+            if radius < SMALLEST:
                 return theta, state, tuple(history), True
             continue
         gain = (cost - trial_cost) / cost
         theta, state, rows, cost = theta + step, trial_state, trial_rows, trial_cost
         if gain < problem.settings.tolerance:
             return theta, state, tuple(history), True
-        damping = max(damping / 10, 1e-6)
-        normal, slope = _normal_equations(
-            problem, rows, problem.whiten(rows), sensitivity(problem.system, state), theta
-        )
+        radius = min(1.0, 3 * radius)
+        normal, slope = _normal_equations(problem, rows, sensitivity(problem.system, state), theta)
     return theta, state, tuple(history), False
 
 
-def _normal_equations(
-    problem: _Problem, rows: Residuals, whitening: Array, du: Array, theta: Array
-) -> tuple[Array, Array]:
+def _normal_equations(problem: _Problem, rows: Residuals, du: Array, theta: Array) -> tuple[Array, Array]:
     jacobian = rows.derivative(du)
-    weight = whitening**2 * problem.influence(rows)
+    weight = problem.whiten(rows) ** 2 * problem.influence(rows)
     prior = problem.prior()
     normal = jacobian.T @ (weight[:, None] * jacobian) + np.diag(prior)
     return normal, jacobian.T @ (weight * rows.value) + prior * theta
 
 
-def _bounded_step(
-    normal: Array, slope: Array, damping: float, theta: Array, low: Array, high: Array, free: Array
-) -> Array:
-    """Damped Gauss-Newton step; entries that would leave the box stop at its wall and the others are solved again."""
+def _bounded_step(normal: Array, slope: Array, theta: Array, low: Array, high: Array, free: Array) -> Array:
+    """Gauss-Newton step; entries that would leave the box stop at its wall and the others are solved again."""
     step = np.zeros_like(theta)
     moving = free.copy()
-    damped = normal + damping * np.diag(np.maximum(np.diag(normal), 1e-12 * np.diag(normal).max()))
+    damped = normal + DAMPING * np.diag(np.maximum(np.diag(normal), 1e-12 * np.diag(normal).max()))
     for _ in range(len(theta)):
         inner = np.flatnonzero(moving)
         if len(inner) == 0:
@@ -274,7 +273,7 @@ def _covariance(problem: _Problem, rows: Residuals, du: Array, theta: Array) -> 
     leave.
     """
     whitening = problem.whiten(rows)
-    normal, _ = _normal_equations(problem, rows, whitening, du, theta)
+    normal, _ = _normal_equations(problem, rows, du, theta)
     weight = whitening**2 * problem.influence(rows)
     freedom = max(float(weight.sum() * problem.settings.surface_sigma_mm**2) - len(theta), 1.0)
     misfit = max(1.0, float((weight * rows.value**2).sum()) / freedom)

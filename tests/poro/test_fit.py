@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -106,8 +108,10 @@ def test_no_trial_reaches_farther_than_contact_can_follow(system: PoroSystem, tr
     history = fit(system, unseen, FitSettings(starts=((1e-9, 0.7, 0.0),))).history
     last = history[0].theta
     for step in history[1:]:
-        assert (np.abs(step.theta - last) <= REACH + 1e-12).all()
+        assert (np.abs(step.theta - last) <= step.radius * REACH + 1e-12).all()
         last = step.theta if step.accepted else last
+    for step, following in pairwise(history):
+        assert step.accepted or following.radius <= 0.3 * step.radius
     assert max(abs(step.theta[0] - history[0].theta[0]) for step in history) > REACH[0]
 
 
