@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 from numba import njit
-from scipy.linalg import lapack
+from scipy.linalg import blas, lapack
 from scipy.sparse import csr_matrix
 
 from poro.dissection import Front, Tree
@@ -114,14 +114,17 @@ def cholesky(matrix: csr_matrix, tree: Tree, block: int) -> Cholesky:
         below = dense[n:, :n] @ inverse.T
         inverses.append(inverse)
         belows.append(below)
-        pending.append(dense[n:, n:] - below @ below.T)
+        rest = dense[n:, n:].copy()
+        if len(rest):
+            blas.dsyrk(-1, below.T, beta=1, c=rest.T, trans=1, overwrite_c=1)
+        pending.append(rest)
         for child in front.children:
             pending[child] = None
     return Cholesky(tree, block, tuple(inverses), tuple(belows))
 
 
 def _assemble(permuted: csr_matrix, tree: Tree, front: Front, block: int, pending: list[Array | None]) -> Array:
-    """The front's dense matrix: its own rows of the matrix plus what its children left over."""
+    """The front's dense matrix, lower triangle: its own rows of the matrix plus what its children left over."""
     start, stop = front.first * block, front.last * block
     border = _unknowns(front.border, block)
     unknowns = np.concatenate([np.arange(start, stop), border])

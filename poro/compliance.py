@@ -54,14 +54,10 @@ class Compliance:
         if self._groups is None:
             label = _bisect(points, GROUPS)
             share = 1 / np.bincount(label)
-            shape = (len(share), 3, len(share), 3)
-            spread: Array = np.zeros((len(label), *shape[1:]), self.matrix.dtype)
-            for axis in range(3):
-                spread[np.arange(len(label)), axis, label, axis] = share[label]
-            flat = spread.reshape(3 * len(label), -1)
-            motion = self.matrix @ flat
-            mean = np.asarray(flat.T @ motion, float).reshape(shape)
-            self._groups = Groups(label, share, motion.reshape(spread.shape), mean)
+            motion = _column_means(self.matrix, label, share).reshape(len(label), 3, len(share), 3)
+            mean = np.zeros((len(share), *motion.shape[1:]))
+            np.add.at(mean, label, motion)
+            self._groups = Groups(label, share, motion, mean * share[:, None, None, None])
         return self._groups
 
     def between(self, nodes: Array, along: Array) -> Array:
@@ -70,9 +66,8 @@ class Compliance:
 
     def apply(self, force: Array) -> Array:
         """Displacements (nc, 3) of all contact nodes under forces (nc, 3), most of them zero."""
-        flat = force.ravel()
-        loaded = np.flatnonzero(flat)
-        return _apply(self.matrix, loaded, flat[loaded]).reshape(-1, 3)
+        loaded = np.flatnonzero(force.any(axis=1))
+        return _apply(self.matrix, loaded, force[loaded]).reshape(-1, 3)
 
 
 def _bisect(points: Array, groups: int) -> Array:
@@ -88,6 +83,20 @@ def _bisect(points: Array, groups: int) -> Array:
     for number, piece in enumerate(pieces):
         label[piece] = number
     return label
+
+
+@njit(cache=True)
+def _column_means(matrix: Array, label: Array, share: Array) -> Array:
+    result = np.zeros((len(matrix), 3 * len(share)), matrix.dtype)
+    for r in range(len(matrix)):
+        sums = np.zeros(3 * len(share))
+        for n in range(len(label)):
+            for b in range(3):
+                sums[3 * label[n] + b] += matrix[r, 3 * n + b]
+        for g in range(len(share)):
+            for b in range(3):
+                result[r, 3 * g + b] = sums[3 * g + b] * share[g]
+    return result
 
 
 @njit(cache=True)
@@ -111,15 +120,14 @@ def _between(matrix: Array, nodes: Array, along: Array) -> Array:
 
 
 @njit(cache=True)
-def _apply(matrix: Array, rows: Array, force: Array) -> Array:
-    size = matrix.shape[1]
+def _apply(matrix: Array, nodes: Array, force: Array) -> Array:
+    size, width = matrix.shape[1], 1024
     u = np.zeros(size)
-    width = 1024
-    for first in range(0, size, width):
-        part = u[first : min(first + width, size)]
-        for k in range(len(rows)):
-            row = matrix[rows[k], first : first + width]
-            f = force[k]
+    for start in range(0, size, width):
+        part = u[start : min(start + width, size)]
+        for k in range(len(nodes)):
+            n, x, y, z = 3 * nodes[k], force[k, 0], force[k, 1], force[k, 2]
+            first, second, third = matrix[n, start:], matrix[n + 1, start:], matrix[n + 2, start:]
             for j in range(len(part)):
-                part[j] += f * row[j]
+                part[j] += x * first[j] + y * second[j] + z * third[j]
     return u

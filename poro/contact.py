@@ -11,7 +11,7 @@ from enum import Enum
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import cho_factor, solve, solve_triangular
+from scipy.linalg import get_lapack_funcs, solve, solve_triangular
 
 from poro.compliance import Compliance
 from poro.curvature import Springs, group_springs
@@ -136,13 +136,30 @@ class Linearized:
         return self.compliance.between(pool, n), offset, self.springs.along_normals(pool, n)
 
     def balance(self, matrix: Array, offset: Array, coupling: Array) -> tuple[Array, Array]:
-        """Normal forces (k,) that close the gaps of all nodes of a pool, and the springs' forces (r,)."""
-        lower = cho_factor(matrix, lower=True, check_finite=False)[0]
-        sides = np.concatenate([offset[:, None], coupling], axis=1)
-        y = solve_triangular(lower, sides, lower=True, check_finite=False)
-        schur = self.springs.matrix - y[:, 1:].T @ y[:, 1:]
-        pull = solve(schur, y[:, 1:].T @ y[:, 0] - self.slack) if len(schur) else np.zeros(0)
-        return -solve_triangular(lower, y @ np.append(1, pull), lower=True, trans=1, check_finite=False), pull
+        """Normal forces (k,) that close the gaps of all nodes of a pool, and the springs' forces (r,).
+
+        Factored in the compliance's own precision and, where that is single, refined once.
+        """
+        own = self.compliance.matrix.dtype
+        (factorize,) = get_lapack_funcs(("potrf",), dtype=own)
+        lower, failed = factorize(matrix.T, lower=1, clean=0)
+        if failed:
+            raise ValueError(f"contact nodes {failed - 1} and an earlier one move alike; the compliance is singular")
+        half = solve_triangular(lower, coupling.astype(own, copy=False), lower=True, check_finite=False)
+        schur = self.springs.matrix - half.T @ half
+
+        def forces(gap: Array, slack: Array) -> tuple[Array, Array]:
+            y = solve_triangular(lower, gap.astype(own, copy=False), lower=True, check_finite=False)
+            pull = solve(schur, half.T @ y - slack) if len(slack) else slack
+            back = solve_triangular(lower, y + half @ pull, lower=True, trans=1, check_finite=False)
+            return -np.asarray(back, float), np.asarray(pull, float)
+
+        push, pull = forces(offset, self.slack)
+        if own == np.float32:
+            left = offset + matrix @ push + coupling @ pull, self.slack + coupling.T @ push + self.springs.matrix @ pull
+            more, stronger = forces(*left)
+            push, pull = push + more, pull + stronger
+        return push, pull
 
     def displacement(self, pool: Array, force: Array, pull: Array) -> Array:
         """Displacements (nc, 3) under normal forces (k,) at nodes `pool` and the springs' forces (r,)."""
@@ -170,7 +187,8 @@ def complementarity(
             matrix, offset, coupling = wall.reduced(pool)
         within = np.searchsorted(pool, rows)
         push = np.zeros(len(pool))
-        push[within], pull = wall.balance(matrix[np.ix_(within, within)], offset[within], coupling[within])
+        among = matrix if len(rows) == len(pool) else matrix[np.ix_(within, within)]
+        push[within], pull = wall.balance(among, offset[within], coupling[within])
         u = wall.displacement(pool, push, pull)
         force = np.zeros(len(active))
         force[pool] = push

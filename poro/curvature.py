@@ -10,7 +10,7 @@ from numba import njit
 from poro.compliance import Compliance, Groups
 from poro.mesh.tetmesh import Array
 
-SPRING_CUT = 1e-3  # springs softer than this share of the stiffest wait for the next linearization
+SPRING_CUT = 0.03  # springs softer than this share of the stiffest wait for the next linearization
 
 
 @dataclass(frozen=True)

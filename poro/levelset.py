@@ -62,17 +62,21 @@ def _evaluate(c: Array, ijk: Array, step: float) -> tuple[Array, Array, Array]:
         wz, dz, sz = _weights(z - k, step)
         for a in range(4):
             for b in range(4):
+                along, slope, bend = 0.0, 0.0, 0.0
                 for e in range(4):
                     f = c[i - 1 + a, j - 1 + b, k - 1 + e]
-                    value[q] += f * wx[a] * wy[b] * wz[e]
-                    gradient[q, 0] += f * dx[a] * wy[b] * wz[e]
-                    gradient[q, 1] += f * wx[a] * dy[b] * wz[e]
-                    gradient[q, 2] += f * wx[a] * wy[b] * dz[e]
-                    hessian[q, 0, 0] += f * sx[a] * wy[b] * wz[e]
-                    hessian[q, 1, 1] += f * wx[a] * sy[b] * wz[e]
-                    hessian[q, 2, 2] += f * wx[a] * wy[b] * sz[e]
-                    hessian[q, 0, 1] += f * dx[a] * dy[b] * wz[e]
-                    hessian[q, 0, 2] += f * dx[a] * wy[b] * dz[e]
-                    hessian[q, 1, 2] += f * wx[a] * dy[b] * dz[e]
+                    along += f * wz[e]
+                    slope += f * dz[e]
+                    bend += f * sz[e]
+                value[q] += wx[a] * wy[b] * along
+                gradient[q, 0] += dx[a] * wy[b] * along
+                gradient[q, 1] += wx[a] * dy[b] * along
+                gradient[q, 2] += wx[a] * wy[b] * slope
+                hessian[q, 0, 0] += sx[a] * wy[b] * along
+                hessian[q, 1, 1] += wx[a] * sy[b] * along
+                hessian[q, 2, 2] += wx[a] * wy[b] * bend
+                hessian[q, 0, 1] += dx[a] * dy[b] * along
+                hessian[q, 0, 2] += dx[a] * wy[b] * slope
+                hessian[q, 1, 2] += wx[a] * dy[b] * slope
         hessian[q, 1, 0], hessian[q, 2, 0], hessian[q, 2, 1] = hessian[q, 0, 1], hessian[q, 0, 2], hessian[q, 1, 2]
     return value, gradient, hessian

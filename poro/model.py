@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import Enum
 from functools import cached_property
 
 import numpy as np
+from scipy.sparse import csr_matrix
 
 from poro.assembly import body_load, gradient_load
 from poro.compliance import Compliance
 from poro.contact import ContactState, ContactStatus, Obstacle, contact_sensitivity, settle
 from poro.flow import Flow
-from poro.levelset import level_set
+from poro.levelset import LevelSet, level_set
 from poro.mesh.patches import patches, principal_axis
 from poro.mesh.tetmesh import Array, TetMesh, signed_volumes
 from poro.modes import LoadMode
@@ -95,7 +96,6 @@ class PoroSystem:
     contact_nodes: Array
     compliance: Compliance
     modes: tuple[LoadMode, ...] = ()
-    cage_offset: Array = field(default_factory=lambda: np.zeros(0))
 
     @cached_property
     def weight_response(self) -> Array:
@@ -123,7 +123,7 @@ class PoroSystem:
         return Suction(self.flow, self.solid, self.pressure_load)
 
     @cached_property
-    def pressure_load(self) -> Array:
+    def pressure_load(self) -> csr_matrix:
         """Sparse (3n, n): nodal forces per kPa of pressure."""
         return self.tissue.biot * gradient_load(self.mesh)
 
@@ -135,12 +135,12 @@ def assemble(
     hilum: Array,
     hilum_displacement: Array,
     modes: tuple[LoadMode, ...] = (),
-    smooth_mm: float | None = None,
+    wall: LevelSet | None = None,
 ) -> PoroSystem:
     """Set a lung up once: factorize, build the cage from its own surface, find the diaphragm.
 
-    gravity: (3,) unit vector RAS; hilum: (k,) nodes whose displacements (k, 3) mm are imposed; smooth_mm: radius over
-    which the cage is rounded, by default one edge. Raises ValueError when gravity is not a unit vector or fewer than
+    gravity: (3,) unit vector RAS; hilum: (k,) nodes whose displacements (k, 3) mm are imposed; wall: another cage than
+    the lung's own surface, rounded over one edge. Raises ValueError when gravity is not a unit vector or fewer than
     three nodes hold.
     """
     gravity = np.asarray(gravity, float)
@@ -153,14 +153,15 @@ def assemble(
     hilum, hilum_displacement = hilum[order], np.asarray(hilum_displacement, float)[order]
     body = solid(mesh, tissue, hilum)
     boundary = mesh.boundary
-    edge = float(np.sqrt(boundary.areas.mean() * 4 / np.sqrt(3)))
-    level = level_set(boundary, 0.7 * edge, edge if smooth_mm is None else smooth_mm)
+    if wall is None:
+        edge = float(np.sqrt(boundary.areas.mean() * 4 / np.sqrt(3)))
+        wall = level_set(boundary, 0.7 * edge, edge)
     on_wall = ~np.isin(boundary.nodes, hilum)
     nodes = boundary.nodes[on_wall]
     rest = mesh.points[nodes]
     moving = patches(boundary, mesh.points[hilum]).diaphragm[on_wall]
-    offset = np.minimum(level.evaluate(rest)[0], 0)
-    obstacle = Obstacle(level, rest, moving, principal_axis(mesh), offset)
+    offset = np.minimum(wall.evaluate(rest)[0], 0)
+    obstacle = Obstacle(wall, rest, moving, principal_axis(mesh), offset)
     place = np.full(3 * len(mesh.points), -1)
     place[body.free_unknowns] = np.arange(len(body.free_unknowns))
     compliance = Compliance(body.solver, place[unknowns_of(nodes)].reshape(-1, 3), len(body.free_unknowns))

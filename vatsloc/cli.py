@@ -174,14 +174,21 @@ def chart(
 
 @bench.command("poro")
 def bench_poro_command(
+    cost: Annotated[bool, typer.Option("--cost", help="Also seconds and memory of every stage against mesh size.")] = (
+        False
+    ),
     max_tets: Annotated[int, typer.Option(metavar="N", help="Largest mesh of the cost table.")] = 500_000,
+    out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="Markdown page to write.")] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Poroelastic lung: seconds and memory against mesh size, displacements and speed beside GetFEM's."""
-    from vatsloc.study.bench_poro import SIZES, bench_poro, table
+    """Poroelastic lung: displacements and speed beside GetFEM's, and cost against mesh size."""
+    from vatsloc.study.bench_poro import bench_poro, page, table
+    from vatsloc.study.cost_poro import SIZES
 
-    result = bench_poro(tuple(size for size in SIZES if size <= max_tets), say=say)
+    result = bench_poro(tuple(size for size in SIZES if cost and size <= max_tets), say=say)
     say(table(result))
+    if out is not None:
+        out.write_text(page(result), encoding="utf-8")
     if as_json:
         show(result)
 

@@ -10,9 +10,11 @@ from numpy.testing import assert_allclose
 
 from poro.tissue import Tissue
 from vatsloc.study import bench_poro as bench
+from vatsloc.study import cost_poro as cost
 from vatsloc.study import stability_poro as stability
 from vatsloc.study.getfem_peer import getfem_python
-from vatsloc.study.poro_lung import HILUM_CENTRE, RADII_MM, in_smooth_wall, lung, system_of, wall_level
+from vatsloc.study.poro_lung import HILUM_CENTRE, RADII_MM, lung, smooth_wall, system_of, wall_level
+from vatsloc.study.tables import markdown
 
 
 def test_getfem_gives_the_same_displacements() -> None:
@@ -22,8 +24,12 @@ def test_getfem_gives_the_same_displacements() -> None:
     assert result is not None
     assert result["rel_diff_free"] < 1e-8
     assert result["rel_diff_contact"] < 1e-3
-    assert min(result["active_nodes"]) > 20
+    assert min(value["nodes in contact"] for value in result["values"]) > 20
+    assert all(row["times faster"] == row["GetFEM s"] / row["ours s"] > 0 for row in result["speed"])
     json.dumps(result)
+    told = bench.page({"getfem": result, "sizes": []})
+    assert "| wall, warm |" in told
+    assert "Cost" not in told
 
 
 def test_without_getfem_the_comparison_is_null(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -31,7 +37,7 @@ def test_without_getfem_the_comparison_is_null(monkeypatch: pytest.MonkeyPatch) 
     told: list[str] = []
     assert bench.compare_getfem(3_000, 4, told.append) is None
     assert "not installed" in told[0]
-    assert "no comparison" in bench.table({"sizes": [], "exponents": {"setup": None}, "getfem": None})
+    assert "no comparison" in bench.table({"sizes": [], "getfem": None})
 
 
 @pytest.mark.parametrize("tets", [3_000, 12_000])
@@ -44,15 +50,21 @@ def test_lung_has_the_size_and_hold_asked_for(tets: int) -> None:
 
 
 def test_sampled_wall_equals_its_expression() -> None:
-    system = in_smooth_wall(system_of(lung(2_000), Tissue()))
+    system = system_of(lung(2_000), Tissue(), smooth_wall())
     moved = system.obstacle.rest + np.random.default_rng(0).uniform(-8, 8, system.obstacle.rest.shape)
     assert_allclose(system.obstacle.level.evaluate(moved)[0], wall_level(moved), atol=1e-3)
 
 
 def test_exponent_of_a_power_law() -> None:
-    rows = [{"tets": n, "setup_s": 3e-6 * n**1.4} for n in (5_000, 40_000, 300_000)]
-    assert bench.exponent(rows, "setup_s") == pytest.approx(1.4)
-    assert bench.exponent(rows[:1], "setup_s") is None
+    rows = [
+        {"tets": n, "contact_nodes": 9, "solver": "factor", "seconds": {"contact": 3e-6 * n**1.4}}
+        for n in (5_000, 40_000, 300_000)
+    ]
+    assert cost.exponent(rows, "seconds", "contact") == pytest.approx(1.4)
+    assert cost.exponent(rows[:1], "seconds", "contact") is None
+    *_, last, slopes = cost.cost_rows(rows, "seconds")
+    assert last["contact"] == pytest.approx(3e-6 * 300_000**1.4)
+    assert (last["mesh"], slopes["contact"], slopes["mesh"]) == ("-", "1.40", "-")
 
 
 def test_sweep_covers_the_range_of_a_fit() -> None:
@@ -72,5 +84,5 @@ def test_penalty_contact_nears_the_active_set_from_behind_the_wall() -> None:
 
 
 def test_rows_become_a_markdown_table() -> None:
-    text = stability.markdown([{"kappa_b": 1e-8, "phi": 0.5}, {"kappa_b": 1e-7, "phi": 0.25}])
+    text = markdown([{"kappa_b": 1e-8, "phi": 0.5}, {"kappa_b": 1e-7, "phi": 0.25}])
     assert text.splitlines()[2:] == ["| 1e-08 | 0.5 |", "| 1e-07 | 0.25 |"]

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import ndimage
 
-from poro.contact import Obstacle
 from poro.levelset import LevelSet
 from poro.mesh import TetMesh, stuff_level_set
 from poro.mesh.tetmesh import Array
@@ -55,18 +54,15 @@ def lung(tets: int, hilum_radius_mm: float = 22.0) -> Lung:
     return Lung(mesh, hilum, motion)
 
 
-def system_of(body: Lung, tissue: Tissue) -> PoroSystem:
-    """The lung set up inside its own outline, `assemble`'s usual wall."""
-    return assemble(body.mesh, tissue, GRAVITY, body.hilum, body.hilum_displacement)
+def system_of(body: Lung, tissue: Tissue, wall: LevelSet | None = None) -> PoroSystem:
+    """The lung set up inside a wall, by default its own outline."""
+    return assemble(body.mesh, tissue, GRAVITY, body.hilum, body.hilum_displacement, wall=wall)
 
 
-def in_smooth_wall(system: PoroSystem, step_mm: float = 2.0) -> PoroSystem:
-    """The same system in front of the wall `WALL`, sampled finely enough for a spline to be exact to microns."""
+def smooth_wall(step_mm: float = 2.0) -> LevelSet:
+    """The wall `WALL`, sampled finely enough for a spline to be exact to microns."""
     origin = -RADII_MM - 45
     shape = np.ceil(-2 * origin / step_mm).astype(int) + 1
     axes = [origin[d] + step_mm * np.arange(shape[d]) for d in range(3)]
     samples = wall_level(np.stack(np.meshgrid(*axes, indexing="ij"), -1))
-    level = LevelSet(ndimage.spline_filter(samples, order=3, mode="mirror"), origin, step_mm)
-    offset = np.minimum(level.evaluate(system.obstacle.rest)[0], 0)
-    obstacle: Obstacle = replace(system.obstacle, level=level, offset=offset)
-    return replace(system, obstacle=obstacle)
+    return LevelSet(ndimage.spline_filter(samples, order=3, mode="mirror"), origin, step_mm)

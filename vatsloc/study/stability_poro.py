@@ -18,15 +18,15 @@ from poro.laws import neo_hookean
 from poro.model import PoroSystem, Theta, solve, without_wall
 from poro.solid import solid
 from poro.tissue import GRAVITY_KPA_PER_MM, Tissue
-from vatsloc.study.poro_lung import in_smooth_wall, lung, system_of
+from vatsloc.study.poro_lung import lung, smooth_wall, system_of
+from vatsloc.study.tables import Row, markdown
 
-Row = dict[str, Any]
 TETS = 3_000
 _TISSUE = Tissue()
 
 
 def _system(tets: int = TETS, tissue: Tissue = _TISSUE, hilum_radius_mm: float = 22.0) -> PoroSystem:
-    return in_smooth_wall(system_of(lung(tets, hilum_radius_mm), tissue))
+    return system_of(lung(tets, hilum_radius_mm), tissue, smooth_wall())
 
 
 def pressure_bounds() -> list[Row]:
@@ -207,12 +207,3 @@ def plot(result: dict[str, list[Row]], out: Path) -> None:
         axes.legend()
         figure.savefig(out / f"{name}.png", dpi=100)
         pyplot.close(figure)
-
-
-def markdown(rows: list[Row]) -> str:
-    """Rows as a markdown table, numbers to three digits."""
-    lines = ["| " + " | ".join(rows[0]) + " |", "|" + "---|" * len(rows[0])]
-    for row in rows:
-        cells = (f"{v:.4g}" if isinstance(v, float) else str(v) for v in row.values())
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines)
