@@ -10,12 +10,15 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from phantoms.cbct import expose, scanner_grid
-from phantoms.fields import Lattice, coverage
-from phantoms.imaging import Picture, State, image_state, nodule_mask
+from phantoms.fields import coverage
+from phantoms.imaging import Picture, State, image_state
 from phantoms.measures import measure
+from phantoms.nodule import Nodule, nodule_mask, paint_nodule
+from phantoms.patient import Patient
 from phantoms.spec import SPECS, PhantomSpec
-from phantoms.states import make_states, scanned_centre
-from phantoms.thorax import Thorax, ct_grid, draw_lung_trees, draw_thorax, image_body, operated_lung
+from phantoms.states import make_states
+from phantoms.thorax import Thorax, ct_grid, draw_lung_trees, draw_thorax, image_body
+from phantoms.tissue import Equilibrium
 from registration.volume import Grid, Mask, Volume
 
 Array = NDArray[Any]
@@ -26,7 +29,7 @@ class PhantomCase:
     """A case and its truth. Images in HU; points in RAS mm of their own image's frame.
 
     gravity_cbct: (3,) unit vector in the frame of the CBCTs; landmarks: (n, 3); dense_truth: (n, 9) in the CT, inflated
-    and deflated; thorax: the person; inflated, deflated: the states, which give the map at any point.
+    and deflated; patient: the person; inflated, deflated: the states, which give the map at any point.
     """
 
     spec: PhantomSpec
@@ -44,7 +47,7 @@ class PhantomCase:
     landmarks_deflated: Array
     dense_truth: Array
     gravity_cbct: Array
-    thorax: Thorax
+    patient: Patient
     inflated: State
     deflated: State
     masks: dict[str, Mask]
@@ -61,19 +64,34 @@ def make_case(spec: PhantomSpec | str, seed: int = 0) -> PhantomCase:
         raise ValueError(f"side must be 'right' or 'left', got {spec.side!r}")
     rng = np.random.default_rng([seed, 11])
     thorax = draw_thorax(spec.side, spec.habitus, spec.lesion, seed, spec.fused)
-    lung = operated_lung(thorax.shapes, spec.side)
-    states, gravity, ends = make_states(thorax, lung, spec, rng)
-    ct, body, ct_lung = _ct(thorax, lung, spec, rng)
-    view = scanned_centre(thorax) + spec.view
+    patient = thorax.patient
+    table = make_states(patient, spec, rng)
+    ct, body, ct_lung = _ct(thorax, patient, spec, rng)
+    return finish_case(patient, spec, seed, table, (ct, body, ct_lung), _forks(patient), rng)
+
+
+def finish_case(
+    patient: Patient,
+    spec: PhantomSpec,
+    seed: int,
+    table: tuple[tuple[State, State], Array, list[Equilibrium]],
+    scan: tuple[Volume, Volume, Mask],
+    places: Array,
+    rng: np.random.Generator,
+) -> PhantomCase:
+    """The case of a patient whose states on the `table` are known. scan: CT, the same without the operated lung and
+    noise, and that lung's mask; places: (n, 3) mm in the CT, where landmarks may be."""
+    (states, gravity, ends), (ct, body, ct_lung) = table, scan
+    view = patient.scanned_centre + spec.view
     grid = scanner_grid(view, spec.cbct_spacing, spec.scanner.length, spec.scanner.fov)
     grids = [_moved_grid(grid, s) for s in states]
-    pictures = [image_state(thorax, body, s, g) for s, g in zip(states, grids, strict=True)]
+    pictures = [image_state(patient, body, s, g) for s, g in zip(states, grids, strict=True)]
     shots = [expose(p.clean, spec.scanner, rng) for p in pictures]
-    nodule = nodule_mask(thorax.nodule, ct.grid)
-    nodule_points = [_nodule_centre(thorax, s) for s in states]
-    ct_marks = _landmarks(thorax, lung, states, grids, spec.scanner.fov, rng)
+    nodule = nodule_mask(patient.nodule, ct.grid)
+    nodule_points = [_nodule_centre(patient.nodule, s) for s in states]
+    ct_marks = _landmarks(places, states, grids, spec.scanner.fov, rng)
     marks = [s.from_ct(ct_marks) for s in states]
-    tissue = states[0].samples[lung.sample(states[0].samples) < -1.0]
+    tissue = states[0].samples[patient.lung.sample(states[0].samples) < -1.0]
     dense_ct = tissue[rng.permutation(len(tissue))[:2000]]
     dense = np.concatenate([dense_ct, *(s.from_ct(dense_ct) for s in states)], axis=1)
     centre = nodule.grid.to_ras(np.argwhere(nodule.inside).mean(axis=0))
@@ -93,7 +111,7 @@ def make_case(spec: PhantomSpec | str, seed: int = 0) -> PhantomCase:
         landmarks_deflated=marks[1],
         dense_truth=dense,
         gravity_cbct=states[1].pose[:3, :3] @ gravity,
-        thorax=thorax,
+        patient=patient,
         inflated=states[0],
         deflated=states[1],
         masks=_masks(ct_lung, pictures),
@@ -108,7 +126,7 @@ def _moved_grid(grid: Grid, state: State) -> Grid:
     return Grid(grid.shape, affine)
 
 
-def _ct(thorax: Thorax, lung: Lattice, spec: PhantomSpec, rng: np.random.Generator) -> tuple[Volume, Volume, Mask]:
+def _ct(thorax: Thorax, patient: Patient, spec: PhantomSpec, rng: np.random.Generator) -> tuple[Volume, Volume, Mask]:
     """The CT, the same without noise and operated lung, and the mask of that lung."""
     grid = ct_grid(thorax, spec.ct_spacing)
     width = float(grid.spacing.mean())
@@ -117,50 +135,39 @@ def _ct(thorax: Thorax, lung: Lattice, spec: PhantomSpec, rng: np.random.Generat
     distance = thorax.shapes.lung(spec.side).on(grid)
     tissue = thorax.parenchyma.on(grid)
     inside = distance < width
-    tissue[inside] += thorax.lobes.fissures.density(grid.points()[inside])
+    tissue[inside] += patient.lobes.fissures.density(grid.points()[inside])
     hu = body + coverage(distance, width) * (tissue - body)
     draw_lung_trees(hu, thorax.trees[thorax.index(spec.side)], grid, width)
-    _paint_nodule(hu, grid, thorax, width)
+    paint_nodule(hu, grid, patient.nodule, width)
     noise = ndimage.gaussian_filter(rng.standard_normal(grid.shape, dtype=np.float32), 0.5)
     hu += noise * (14.0 / noise.std())
     affine = grid.ras_from_ijk
     return Volume(np.clip(hu, -1024, 3071), affine), Volume(body, affine), Mask(distance < 0, affine)
 
 
-def _paint_nodule(hu: Array, grid: Grid, thorax: Thorax, width: float) -> None:
-    reach = thorax.nodule.radius + 4
-    corners = grid.to_ijk(thorax.nodule.centre + np.array([[-reach] * 3, [reach] * 3]))
-    lo = np.maximum(np.floor(corners.min(axis=0)), 0).astype(int)
-    sub = grid.box(lo, corners.max(axis=0) + 1)
-    view = hu[tuple(slice(a, a + n) for a, n in zip(lo, sub.shape, strict=True))]
-    view += coverage(thorax.nodule.distance(sub.points()), width) * (thorax.nodule.density(sub.points()) - view)
-
-
-def _nodule_centre(thorax: Thorax, state: State) -> Array:
+def _nodule_centre(nodule: Nodule, state: State) -> Array:
     """Centre of mass of the nodule in the state, RAS mm of its image: mapped points weighted by their volume."""
-    n = thorax.nodule
-    ball = np.stack(np.meshgrid(*[np.linspace(-1.2, 1.2, 17)] * 3), axis=-1).reshape(-1, 3) * n.radius + n.centre
-    ball = ball[n.distance(ball) < 0]
+    ball = np.stack(np.meshgrid(*[np.linspace(-1.2, 1.2, 17)] * 3), axis=-1).reshape(-1, 3) * nodule.radius
+    ball += nodule.centre
+    ball = ball[nodule.distance(ball) < 0]
     weight = state.lung_map.determinant(ball)
     return np.asarray(weight @ state.from_ct(ball) / weight.sum())
 
 
-def _landmarks(
-    thorax: Thorax,
-    lung: Lattice,
-    states: tuple[State, State],
-    grids: list[Grid],
-    fov: float,
-    rng: np.random.Generator,
-) -> Array:
-    """Forks of vessels and airways in the CT, RAS mm, that both cone-beam images show, spread far apart."""
-    trees = thorax.trees[thorax.index(thorax.side)]
+def _forks(patient: Patient) -> Array:
+    """Forks (n, 3) of vessels and airways inside the lung in the CT, RAS mm, of branches wide enough to be seen."""
     sets = []
-    for tree in (trees.airway, trees.artery, trees.vein):
+    for tree in () if patient.trees is None else (patient.trees.airway, patient.trees.artery, patient.trees.vein):
         forks = tree.forks()
         sets.append(tree.nodes[forks[tree.radius[forks] > 1.15]])
     points = np.concatenate(sets)
-    points = points[lung.at(points) < -4.0]
+    return np.asarray(points[patient.lung.at(points) < -4.0])
+
+
+def _landmarks(
+    points: Array, states: tuple[State, State], grids: list[Grid], fov: float, rng: np.random.Generator
+) -> Array:
+    """Those of `points` (n, 3) in the CT, RAS mm, that both cone-beam images show, spread far apart."""
     for state, grid in zip(states, grids, strict=True):
         ijk = grid.to_ijk(state.from_ct(points))
         off = (ijk - (np.array(grid.shape) - 1) / 2) * grid.spacing

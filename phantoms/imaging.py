@@ -13,8 +13,10 @@ from scipy.spatial import cKDTree
 from phantoms.cage import CageMotion
 from phantoms.fields import Lattice, coverage, refine, smoothstep
 from phantoms.lobes import LobedMap
+from phantoms.patient import Patient
 from phantoms.spline import SplineMap
-from phantoms.thorax import LungTrees, Nodule, Thorax, draw_lung_trees
+from phantoms.thorax import draw_lung_trees
+from phantoms.trees import LungTrees
 from registration.volume import Grid, Mask, Volume
 
 Array = NDArray[Any]
@@ -61,7 +63,7 @@ class Picture:
     nodule: Mask
 
 
-def image_state(thorax: Thorax, body: Volume, state: State, grid: Grid) -> Picture:
+def image_state(patient: Patient, body: Volume, state: State, grid: Grid) -> Picture:
     """Image of a state on `grid`. body: the CT without its operated lung (HU)."""
     width = float(grid.spacing.mean())
     x = np.stack([a.ravel() for a in np.moveaxis(state_points(state, grid), -1, 0)], axis=1)
@@ -71,17 +73,18 @@ def image_state(thorax: Thorax, body: Volume, state: State, grid: Grid) -> Pictu
     del x
     source, ratio, edge = _lung_sources(state, grid, within)
     share = np.ones_like(edge) if state.held else coverage(edge, width)
-    resting = thorax.parenchyma.sample(source) + thorax.lobes.fissures.density(source)
-    lesion = coverage(thorax.nodule.distance(source) * np.cbrt(ratio), width) * share
-    resting += lesion * (thorax.nodule.density(source) - resting)
+    resting = patient.tissue(source)
+    lesion = coverage(patient.nodule.distance(source) * np.cbrt(ratio), width) * share
+    if patient.nodule.kind != "given":
+        resting += lesion * (patient.nodule.density(source) - resting)
     tissue = np.minimum((resting + 1000) / ratio - 1000, 40.0)
     inner = PLEURAL_AIR_HU + share * (tissue - PLEURAL_AIR_HU)
     flat = hu.ravel()
     flat[within] += room[within] * (inner - flat[within])
-    trees = carry_trees(thorax.trees[thorax.index(thorax.side)], state)
-    plain = flat[within].copy()
-    draw_lung_trees(hu, trees, grid, width)
-    flat[within] += lesion * room[within] * (plain - flat[within])
+    if patient.trees is not None:
+        plain = flat[within].copy()
+        draw_lung_trees(hu, carry_trees(patient.trees, state), grid, width)
+        flat[within] += lesion * room[within] * (plain - flat[within])
     lung, nodule = np.zeros(hu.size, dtype=bool), np.zeros(hu.size, dtype=bool)
     lung[within] = (share > 0.5) & (room[within] > 0.5)
     nodule[within] = lesion > 0.5
@@ -103,20 +106,6 @@ def carry_trees(trees: LungTrees, state: State) -> LungTrees:
         inside = state.lung_map(tree.nodes)
         moved.append(tree.moved(state.posed(inside + outside * (state.motion(tree.nodes) - inside))))
     return LungTrees(*moved)
-
-
-def nodule_mask(nodule: Nodule, grid: Grid) -> Mask:
-    """Voxels of the CT whose centres lie in the nodule."""
-    inside = np.zeros(grid.shape, dtype=bool)
-    reach = nodule.radius + nodule.relief + 2 * grid.spacing.max()
-    corners = grid.to_ijk(
-        nodule.centre + reach * np.array([[a, b, c] for a in (-1, 1) for b in (-1, 1) for c in (-1, 1)])
-    )
-    lo = np.maximum(np.floor(corners.min(axis=0)), 0).astype(int)
-    sub = grid.box(lo, corners.max(axis=0) + 1)
-    n = sub.shape
-    inside[lo[0] : lo[0] + n[0], lo[1] : lo[1] + n[1], lo[2] : lo[2] + n[2]] = nodule.distance(sub.points()) < 0
-    return Mask(inside, grid.ras_from_ijk)
 
 
 def _coarse(grid: Grid, step_mm: float) -> tuple[Grid, int]:

@@ -37,11 +37,13 @@ class Sheet:
 @dataclass(frozen=True)
 class Fissures:
     """Sheets of pleura between the lobes of a lung. oblique: above the lower lobe; horizontal: between upper and middle
-    lobe, in a right lung only. grown_mm: within this distance of the hilum the lobes have grown together."""
+    lobe, in a right lung only. grown_mm: within this distance of the hilum the lobes have grown together;
+    drawn: whether images need to be given the line, because the lung's tissue does not hold it."""
 
     oblique: Sheet
     horizontal: Sheet | None
     grown_mm: float = 0.0
+    drawn: bool = True
 
     def distance(self, points: Array) -> Array:
         """Distance in mm, not below zero, of points (..., 3) in the CT from the nearest sheet."""
@@ -57,6 +59,8 @@ class Fissures:
 
     def density(self, points: Array) -> Array:
         """HU that the sheets of pleura add at points (..., 3); none where lobes have partly grown together."""
+        if not self.drawn:
+            return np.zeros(points.shape[:-1])
         line = LINE_HU * np.exp(-((self.distance(points) / LINE_MM) ** 2))
         return np.asarray(line if np.isinf(self.grown_mm) else line * ~self.grown(points))
 

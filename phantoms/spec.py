@@ -66,10 +66,12 @@ SPECS = {
         replace(_SMALL, name="small-right"),
         replace(_SMALL, name="small-left", side="left"),
         PhantomSpec("right", "right", fused=0.5, collapse=Collapse(lobes_apart=0.1)),
-        PhantomSpec("left", "left", lesion=Lesion(depth=25.0), collapse=Collapse(inflated=0.83)),
-        PhantomSpec("small-collapse", "right", fused=0.8, collapse=Collapse(deflated=0.64, dome_rise=0.0)),
+        PhantomSpec("left", "left", lesion=Lesion(depth=25.0), collapse=Collapse(inflated=0.83, patchiness=0.3)),
         PhantomSpec(
-            "near-total-collapse", "left", fused=0.0, collapse=Collapse(deflated=0.40, dome_rise=12.0, lobes_apart=0.2)
+            "small-collapse", "right", fused=0.8, collapse=Collapse(deflated=0.64, dome_rise=0.0, patchiness=0.6)
+        ),
+        PhantomSpec(
+            "near-total-collapse", "left", fused=0.0, collapse=Collapse(deflated=0.40, dome_rise=12.0, lobes_apart=0.1)
         ),
         PhantomSpec("co2-right", "right", fused=0.3, lesion=Lesion(depth=20.0, radius=6.0), collapse=_CO2),
         PhantomSpec("co2-left", "left", lesion=Lesion(radius=10.0), collapse=replace(_CO2, deflated=0.46)),
@@ -80,7 +82,12 @@ SPECS = {
         PhantomSpec(
             "base", "right", fused=0.0, lesion=Lesion(place="base", depth=10.0), collapse=Collapse(lobes_apart=0.1)
         ),
-        PhantomSpec("ground-glass", "right", lesion=Lesion("ground-glass", depth=18.0, radius=9.0)),
+        PhantomSpec(
+            "ground-glass",
+            "right",
+            lesion=Lesion("ground-glass", depth=18.0, radius=9.0),
+            collapse=Collapse(patchiness=0.4),
+        ),
         PhantomSpec("part-solid", "left", fused=0.2, lesion=Lesion("part-solid", radius=11.0)),
         PhantomSpec(
             "tight-view",

@@ -13,8 +13,8 @@ from phantoms.cage import CageMotion, fit_dome
 from phantoms.fields import Lattice, coverage, smooth_noise, smoothstep
 from phantoms.imaging import State
 from phantoms.lobes import surface_points
+from phantoms.patient import Patient
 from phantoms.spec import Collapse, PhantomSpec
-from phantoms.thorax import Thorax
 from phantoms.tissue import Equilibrium, Hilum, Pleura, Tissue, relax, tissue_points
 
 Array = NDArray[Any]
@@ -23,15 +23,15 @@ HINGE_MM = 13.0
 
 
 def make_states(
-    thorax: Thorax, lung: Lattice, spec: PhantomSpec, rng: np.random.Generator
+    patient: Patient, spec: PhantomSpec, rng: np.random.Generator
 ) -> tuple[tuple[State, State], Array, list[Equilibrium]]:
     """Inflated and deflated state of the operated lung, gravity (3,) in the CT's frame, and both equilibria.
 
-    lung: signed distance (mm) of that lung in the CT. Gravity acts from the operated side to the other.
+    Gravity acts from the operated side to the other.
     """
-    sign = 1 if spec.side == "right" else -1
+    sign, lung, lobes = patient.sign, patient.lung, patient.lobes
     collapse = spec.collapse
-    inflated_motion = fit_dome(CageMotion(thorax.build, sign, 0.0, 16.0, 5.0, 6.0), lung, collapse.inflated)
+    inflated_motion = fit_dome(CageMotion(patient.build, sign, 0.0, 16.0, 5.0, 6.0), lung, collapse.inflated)
     deflated_motion = replace(
         inflated_motion,
         operated_dome=inflated_motion.operated_dome + collapse.dome_rise,
@@ -40,14 +40,12 @@ def make_states(
     )
     gravity = np.array([-sign, 0.15, 0.05]) + rng.normal(0, 0.03, 3)
     gravity /= np.linalg.norm(gravity)
-    lobes = thorax.lobes
     points, volume, lobe = _by_lobe([tissue_points(region, spec.element / 2) for region in lobes.regions])
     surface = _by_lobe([surface_points(region, 2) for region in lobes.regions])
-    hilum = thorax.hila[thorax.index(spec.side)]
-    tied = np.linalg.norm(points - hilum, axis=1) < (20.0 if len(lobes.regions) == 1 else HINGE_MM)
-    shear, slack = _uneven(thorax, lung, points, lobe, collapse, rng)
+    tied = np.linalg.norm(points - patient.hilum, axis=1) < (20.0 if len(lobes.regions) == 1 else HINGE_MM)
+    shear, slack = _uneven(patient, points, lobe, collapse, rng)
     rest = np.cbrt(np.clip(collapse.deflated * slack, 0.15, 0.95))
-    poses = _poses(scanned_centre(thorax), rng)
+    poses = _poses(patient.scanned_centre, rng)
     states, ends = [], []
     for motion, held, pose in ((inflated_motion, True, poses[0]), (deflated_motion, False, poses[1])):
         cavity = motion.carry(lung)
@@ -80,23 +78,23 @@ def _pleura(surface: tuple[Array, Array, Array], lung: Lattice, cavity: Lattice,
 
 
 def _uneven(
-    thorax: Thorax, lung: Lattice, points: Array, lobe: Array, collapse: Collapse, rng: np.random.Generator
+    patient: Patient, points: Array, lobe: Array, collapse: Collapse, rng: np.random.Generator
 ) -> tuple[Array, Array]:
     """Shear modulus (kPa) and factor on the rest volume: patchy tissue, soft fissure, stiff root, airless tissue and
     nodule."""
     patchiness = collapse.patchiness
-    hilum = thorax.hila[thorax.index(thorax.side)]
+    lung, hilum = patient.lung, patient.hilum
     shear = 0.65 * np.exp(0.45 * patchiness * lung.like(smooth_noise(lung, 32.0, rng)).at(points))
     slack = np.exp(0.22 * patchiness * lung.like(smooth_noise(lung, 38.0, rng)).at(points))
-    slack *= np.exp(collapse.lobes_apart * _odds(len(thorax.lobes.regions), thorax.seed))[lobe]
+    slack *= np.exp(collapse.lobes_apart * _odds(len(patient.lobes.regions), patient.seed))[lobe]
     shear *= 1 + 5 * np.exp(-((np.linalg.norm(points - hilum, axis=1) / 24) ** 2))
-    fissures = thorax.lobes.fissures
+    fissures = patient.lobes.fissures
     shear *= 1 - 0.85 * np.exp(-((fissures.distance(points) / 8) ** 2)) * fissures.grown(points)
     airless = _airless(points, collapse.atelectasis)
     shear *= 1 + 5 * airless
     slack *= 1 - 0.75 * airless
-    lesion = coverage(thorax.nodule.distance(points), 8.0)
-    return shear * (1 + (thorax.nodule.stiffening - 1) * lesion), slack + lesion * (1.6 - slack)
+    lesion = coverage(patient.nodule.distance(points), 8.0)
+    return shear * (1 + (patient.nodule.stiffening - 1) * lesion), slack + lesion * (1.6 - slack)
 
 
 def _odds(count: int, seed: int) -> Array:
@@ -129,9 +127,3 @@ def _about(centre: Array, rng: np.random.Generator, degrees: float, shift_mm: fl
     pose[:3, :3] = turn
     pose[:3, 3] = centre + shift_mm * way / np.linalg.norm(way) - turn @ centre
     return pose
-
-
-def scanned_centre(thorax: Thorax) -> Array:
-    """Middle of the scanner's field of view in the frame of the CT."""
-    sign = 1 if thorax.side == "right" else -1
-    return np.array([sign * 56.0, -6.0, -42.0])

@@ -12,51 +12,15 @@ from scipy import ndimage
 from phantoms.anatomy import Build, Shapes, draw_build, make_shapes, spine_y
 from phantoms.fields import Lattice, coverage, smooth_noise, smoothstep
 from phantoms.lobes import Fissures, Lobes, Sheet, cut, whole
+from phantoms.nodule import Nodule
+from phantoms.patient import Patient
 from phantoms.skeleton import Vertebra, draw_bones, draw_spine
 from phantoms.spec import Lesion
-from phantoms.trees import Tree, draw_tubes, grow, tubes
+from phantoms.trees import LungTrees, Tree, draw_tubes, grow, tubes
 from registration.volume import Grid
 
 Array = NDArray[Any]
 BLOOD_HU, WALL_HU, AIR_HU = 42.0, 10.0, -990.0
-SOLID_HU, GLASS_HU = 25.0, -560.0
-
-
-@dataclass(frozen=True)
-class LungTrees:
-    """Trees of one lung, RAS mm in the CT: bronchi, pulmonary arteries along them, veins between them."""
-
-    airway: Tree
-    artery: Tree
-    vein: Tree
-
-
-@dataclass(frozen=True)
-class Nodule:
-    """A ball of radius (mm) whose surface waves by `relief` mm. centre: (3,) RAS mm in the CT; kind: see `Lesion`."""
-
-    centre: Array
-    radius: float
-    relief: float
-    kind: str
-
-    @property
-    def stiffening(self) -> float:
-        """Factor on the shear modulus of lung tissue."""
-        return {"solid": 11.0, "part-solid": 6.0, "ground-glass": 2.0}[self.kind]
-
-    def density(self, points: Array) -> Array:
-        """HU in the CT at points (..., 3) of the lesion; a part-solid one has a solid core of half its radius."""
-        core = {"solid": np.inf, "part-solid": 0.5 * self.radius, "ground-glass": -np.inf}[self.kind]
-        depth = np.linalg.norm(points - self.centre, axis=-1) - core
-        return GLASS_HU + smoothstep(-depth, -1.0, 1.0) * (SOLID_HU - GLASS_HU)
-
-    def distance(self, points: Array) -> Array:
-        """Signed distance in mm of points (..., 3), negative inside."""
-        d = points - self.centre
-        r = np.linalg.norm(d, axis=-1)
-        wave = np.sin(0.9 * d[..., 0] + 1) * np.sin(0.8 * d[..., 1] + 2) * np.sin(0.7 * d[..., 2] + 3)
-        return r - self.radius - self.relief * wave
 
 
 @dataclass(frozen=True)
@@ -79,6 +43,23 @@ class Thorax:
         """Measures of the person."""
         return self.shapes.build
 
+    @property
+    def patient(self) -> Patient:
+        """What the collapse of the operated lung needs to know."""
+        n = self.index(self.side)
+        lung = operated_lung(self.shapes, self.side)
+        return Patient(
+            self.side,
+            self.seed,
+            self.build,
+            lung,
+            self.lobes,
+            self.hila[n],
+            self.nodule,
+            self.parenchyma,
+            self.trees[n],
+        )
+
     def index(self, side: str) -> int:
         """Place of a side in the pairs of this class."""
         return 0 if side == "right" else 1
@@ -98,7 +79,7 @@ def draw_thorax(side: str, habitus: str, lesion: Lesion, seed: int, fused: float
     regions: list[tuple[Lattice, ...]] = [(shapes.right_lung,), (shapes.left_lung,)]
     regions[own] = regions[own] if parts is None else parts.regions
     trees = (lung_trees(regions[0], hila[0], 1, rng), lung_trees(regions[1], hila[1], -1, rng))
-    centre = _place_nodule(shapes.lung(side), build, lesion, 1 - 2 * own, parts, rng)
+    centre = place_nodule(shapes.lung(side), build, lesion, 1 - 2 * own, parts, rng)
     nodule = Nodule(centre, lesion.radius, 0.12 * lesion.radius, lesion.kind)
     line = Sheet(hila[own], 8.0, rng.uniform(0.7, 1.1), rng.uniform(-8, 8))
     lobes = parts or whole(lung, Fissures(line, None, np.inf))
@@ -281,9 +262,13 @@ def _keep_inside(tree: Tree, regions: tuple[Lattice, ...], depth_mm: float) -> A
     return nodes
 
 
-def _place_nodule(
+def place_nodule(
     lung: Lattice, build: Build, lesion: Lesion, sign: int, lobes: Lobes | None, rng: np.random.Generator
 ) -> Array:
+    """A centre (3,) mm for a lesion in a lung (signed distance, mm), clear of fissures; sign: 1 right, -1 left.
+
+    Raises ValueError where the lung has no such place.
+    """
     points = lung.points()
     apt = np.abs(lung.values.ravel() + lesion.depth) < 1.5
     if lobes is not None:

@@ -48,6 +48,15 @@ class Tree:
         return np.flatnonzero(np.bincount(inner, minlength=len(self.nodes)) >= 2)
 
 
+@dataclass(frozen=True)
+class LungTrees:
+    """Trees of one lung, RAS mm in the CT: bronchi, pulmonary arteries along them, veins between them."""
+
+    airway: Tree
+    artery: Tree
+    vein: Tree
+
+
 def grow(
     clouds: Sequence[Array], root: Array, hilum: Array, leaf_points: int, leaf_radius: float, exponent: float
 ) -> Tree:

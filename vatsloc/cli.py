@@ -115,18 +115,43 @@ def phantom(
         Path | None, typer.Option(metavar="DIR", help="Write every case of the suite; those there are kept.")
     ] = None,
     jobs: Annotated[int, typer.Option(metavar="N", min=1, help="Cases of the suite made at once.")] = 1,
+    from_ct: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Chest CT to make a twin of, collapsed like NAME if given.")
+    ] = None,
+    side: Annotated[
+        str, typer.Option(metavar="SIDE", help="Lung of the twin that collapses: right or left.")
+    ] = "right",
+    nodule: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Mask of the nodule in the CT; else one is put in.")
+    ] = None,
+    series: Annotated[
+        int | None, typer.Option(metavar="N", min=10, max=100, help="Breathe the twin instead: N states of one breath.")
+    ] = None,
 ) -> None:
-    """Write a synthetic case with known truth, or the whole suite with a table of how hard its cases are."""
-    from vatsloc.phantom_case import write_phantom
+    """Write a synthetic case with known truth, the whole suite with a table of how hard its cases are, or the twin of a
+    scan: collapsed, or breathing."""
+    from vatsloc.phantom_case import write_phantom, write_twin
+    from vatsloc.phantom_series import write_series
     from vatsloc.study.suite import table, write_suite
 
-    if suite is not None and name is None and out is None:
+    if side not in ("right", "left"):
+        raise CaseError(f'--side must be right or left, got "{side}".')
+    if suite is not None and (name, out, from_ct) == (None, None, None):
         print(table(write_suite(suite, jobs, say)))
-    elif suite is None and name is not None and out is not None:
+    elif suite is None and out is not None and from_ct is not None:
+        if series is None:
+            write_twin(from_ct, side, out, name, seed, nodule, say)
+        else:
+            write_series(from_ct, side, out, series, seed, say)
+        print(out)
+    elif suite is None and from_ct is None and name is not None and out is not None:
         write_phantom(name, out, seed, say)
         print(out)
     else:
-        raise CaseError("phantom makes one case (NAME --out CASE) or the suite (--suite DIR); give one of the two.")
+        raise CaseError(
+            "phantom makes one case (NAME --out CASE), the suite (--suite DIR) or a twin (--from-ct FILE --out CASE); "
+            "give one of the three."
+        )
 
 
 @app.command()

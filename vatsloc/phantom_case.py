@@ -3,20 +3,26 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+from collections.abc import Callable
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from phantoms.case import PhantomCase, make_case
-from phantoms.spec import SPECS
+from phantoms.spec import SPECS, PhantomSpec
+from phantoms.twin import Scan, make_twin
 from registration.volume import Array
-from vatsloc.errors import CaseError
+from vatsloc.errors import CaseError, InputRefused
 from vatsloc.formats.casefile import FILE_NAME
 from vatsloc.formats.folder import whole_folder
+from vatsloc.formats.images import read_mask, read_volume
 from vatsloc.formats.markups import PointList, write_points
 from vatsloc.formats.nifti import write_mask, write_volume
+from vatsloc.imaging.hilum import find_hilum
+from vatsloc.imaging.lungs import Side, segment_lungs
+from vatsloc.imaging.spine import segment_spine
 from vatsloc.workflow.stages import Say, Stages, quiet
 
 INFO_FILE = "truth/info.json"
@@ -31,15 +37,61 @@ def write_phantom(name: str, folder: Path, seed: int = 0, say: Say = quiet) -> N
     if name not in SPECS:
         raise CaseError(f'"{name}" is no phantom; choose one of {", ".join(SPECS)}.')
     say(f"phantom {name}, seed {seed} ...")
+    _write_whole(lambda: make_case(name, seed), folder, recipe(name, seed), say)
+
+
+def write_twin(
+    ct: Path,
+    side: Side,
+    folder: Path,
+    name: str | None = None,
+    seed: int = 0,
+    nodule: Path | None = None,
+    say: Say = quiet,
+) -> None:
+    """Make the digital twin of one scan and write it as a case folder, whole or not at all.
+
+    ct: image or DICOM folder; name: phantom whose collapse, lesion and scanner it gets; nodule: mask of the one it has,
+    else one is put in. Raises CaseError for an unknown name, InputRefused where the scan does not show what is needed.
+    """
+    spec = twin_spec(side, name)
+    say(f"twin of {ct.name}, {side} lung, seed {seed} ...")
+    scan = read_scan(ct, side, nodule)
+    made_from = {"spec": json.loads(json.dumps(asdict(spec))), "seed": seed, "scan": ct.name}
+    try:
+        _write_whole(lambda: make_twin(scan, spec, seed), folder, made_from, say)
+    except ValueError as refusal:
+        raise InputRefused(f"{ct}: {refusal}.") from refusal
+
+
+def twin_spec(side: Side, name: str | None) -> PhantomSpec:
+    """What a twin is made like: the phantom called `name`, on `side`. Raises CaseError for an unknown name."""
+    if name is not None and name not in SPECS:
+        raise CaseError(f'"{name}" is no phantom; choose one of {", ".join(SPECS)}.')
+    like = PhantomSpec("twin", side) if name is None else SPECS[name]
+    return replace(like, name="twin", side=side, fused=1.0)
+
+
+def read_scan(ct: Path, side: Side, nodule: Path | None = None) -> Scan:
+    """A chest CT with its lungs, spine and the root of the lung on `side`; raises InputRefused where it lacks one."""
+    image = read_volume(ct)
+    given = None if nodule is None else read_mask(nodule)
+    lungs = segment_lungs(image, side, given)
+    hilum = find_hilum(lungs.of(side), lungs.airways, side)
+    masks = {"right": lungs.right, "left": lungs.left}
+    return Scan(image, masks, segment_spine(image).centres_ras, hilum.point_ras, given)
+
+
+def _write_whole(make: Callable[[], PhantomCase], folder: Path, made_from: dict[str, Any], say: Say) -> None:
     log = Stages()
     with whole_folder(folder, (FILE_NAME, INFO_FILE), _is_phantom) as partial:
         with log.stage("phantom"):
-            made = make_case(name, seed)
+            made = make()
             _write(made, partial)
         cost = {"seconds": log.seconds["phantom"], "peak_mb": log.peak_mb["phantom"]}
-        info = recipe(name, seed) | cost | made.info
+        info = made_from | cost | made.info
         (partial / INFO_FILE).write_text(json.dumps(info, indent=1) + "\n", encoding="utf-8")
-    say(f"{name} written to {folder}: {cost['seconds']:.0f} s, {cost['peak_mb']:.0f} MB")
+    say(f"{made.spec.name} written to {folder}: {cost['seconds']:.0f} s, {cost['peak_mb']:.0f} MB")
 
 
 def recipe(name: str, seed: int) -> dict[str, Any]:

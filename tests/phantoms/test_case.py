@@ -14,7 +14,6 @@ from phantoms.cbct import scanner_grid
 from phantoms.imaging import State, image_state
 from phantoms.lobes import Fissures
 from phantoms.measures import fissure_jump, lobe_overlap
-from phantoms.trees import Tree
 from registration.volume import Volume, axis_codes
 
 COARSE = PhantomSpec("coarse", "left", ct_spacing=(4.0, 4.0, 4.0), cbct_spacing=(4.0, 4.0, 4.0), element=24.0)
@@ -33,7 +32,7 @@ def test_map_and_inverse_agree_at_two_thousand_points(case: PhantomCase) -> None
         back, left = state.to_ct(moved)
         off = np.linalg.norm(back - case.dense_truth[:, :3], axis=1)
         # Lobes press a little into each other: there, and only there, two sources claim a place.
-        beside = case.thorax.lobes.fissures.distance(case.dense_truth[:, :3]) < 1.0
+        beside = case.patient.lobes.fissures.distance(case.dense_truth[:, :3]) < 1.0
         assert off[~beside | (len(state.lung_map.pieces) == 1)].max() < 0.01
         assert left.max() < 0.01
 
@@ -53,21 +52,19 @@ def test_volumes_are_those_asked_for(case: PhantomCase) -> None:
 
 
 def test_mass_of_the_lung_is_kept(case: PhantomCase) -> None:
-    nothing = Tree(np.zeros((1, 3)), np.array([-1]), np.zeros(1), np.zeros(1, dtype=int), np.zeros(1, dtype=int))
-    bare = replace(case.thorax.trees[0], airway=nothing, artery=nothing, vein=nothing)
-    far = replace(case.thorax.nodule, centre=np.array([1e4, 0.0, 0.0]))
-    lobes = case.thorax.lobes
+    far = replace(case.patient.nodule, centre=np.array([1e4, 0.0, 0.0]))
+    lobes = case.patient.lobes
     away = replace(lobes.fissures.oblique, hilum=np.array([0.0, 0.0, 1e4]))
     lobes = replace(lobes, fissures=Fissures(away, None))
-    thorax = replace(case.thorax, trees=(bare, bare), nodule=far, lobes=lobes)
+    patient = replace(case.patient, trees=None, nodule=far, lobes=lobes)
     lung = case.inflated.lung
     inside = lung.values.ravel() < 0
-    before = (thorax.parenchyma.at(lung.points()[inside]) + 1000).sum() * lung.spacing**3
+    before = (patient.parenchyma.at(lung.points()[inside]) + 1000).sum() * lung.spacing**3
     for _, state, _ in _states(case):
         middle = state.posed(state.lung_map(state.samples)).mean(axis=0)
         grid = scanner_grid(middle, (2.5, 2.5, 2.5), 340.0, 260.0)
         body = Volume(np.full((4, 4, 4), -1000, dtype=np.float32), np.diag([1.0, 1, 1, 1]))
-        hu = image_state(thorax, body, state, grid).clean.hu
+        hu = image_state(patient, body, state, grid).clean.hu
         after = (hu[hu > -990] + 1000).sum() * 2.5**3
         assert after == pytest.approx(before, rel=0.01)
 
@@ -95,7 +92,7 @@ def test_lobes_slide_along_the_fissures_and_part_only_when_collapsed(lobed: Phan
 
 
 def test_landmarks_and_nodule_lie_inside_one_lobe(lobed: PhantomCase) -> None:
-    lobes = lobed.thorax.lobes
+    lobes = lobed.patient.lobes
     depth = np.sort([r.at(lobed.landmarks_ct) for r in lobes.regions], axis=0)
     assert depth[0].max() < -1.0
     assert depth[1].min() > 0.5
@@ -105,8 +102,10 @@ def test_landmarks_and_nodule_lie_inside_one_lobe(lobed: PhantomCase) -> None:
 
 
 def test_vessels_feed_their_own_lobe(lobed: PhantomCase) -> None:
-    lobes = lobed.thorax.lobes
-    for tree in (lobed.thorax.trees[0].airway, lobed.thorax.trees[0].artery, lobed.thorax.trees[0].vein):
+    lobes = lobed.patient.lobes
+    trees = lobed.patient.trees
+    assert trees is not None
+    for tree in (trees.airway, trees.artery, trees.vein):
         fine = tree.generation > 2
         assert np.array_equal(lobes.at(tree.nodes[fine]), tree.cloud[fine])
 
@@ -207,7 +206,7 @@ def test_equal_seeds_give_equal_cases_and_others_do_not(demo: PhantomCase, left:
     assert np.array_equal(left.ct.hu, same.ct.hu)
     assert np.array_equal(left.cbct_deflated.hu, same.cbct_deflated.hu)
     assert np.array_equal(left.dense_truth, same.dense_truth)
-    assert left.thorax.build.width != demo.thorax.build.width
+    assert left.patient.build.width != demo.patient.build.width
 
 
 def test_left_case_collapses_on_the_left(left: PhantomCase) -> None:
