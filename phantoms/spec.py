@@ -71,7 +71,10 @@ SPECS = {
             "small-collapse", "right", fused=0.8, collapse=Collapse(deflated=0.64, dome_rise=0.0, patchiness=0.6)
         ),
         PhantomSpec(
-            "near-total-collapse", "left", fused=0.0, collapse=Collapse(deflated=0.40, dome_rise=12.0, lobes_apart=0.1)
+            "near-total-collapse",
+            "left",
+            fused=0.0,
+            collapse=Collapse(deflated=0.40, dome_rise=12.0, patchiness=0.5, lobes_apart=0.1),
         ),
         PhantomSpec("co2-right", "right", fused=0.3, lesion=Lesion(depth=20.0, radius=6.0), collapse=_CO2),
         PhantomSpec("co2-left", "left", lesion=Lesion(radius=10.0), collapse=replace(_CO2, deflated=0.46)),

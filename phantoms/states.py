@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -29,7 +29,7 @@ def make_states(
 
     Gravity acts from the operated side to the other.
     """
-    sign, lung, lobes = patient.sign, patient.lung, patient.lobes
+    sign, lung = patient.sign, patient.lung
     collapse = spec.collapse
     inflated_motion = fit_dome(CageMotion(patient.build, sign, 0.0, 16.0, 5.0, 6.0), lung, collapse.inflated)
     deflated_motion = replace(
@@ -40,28 +40,48 @@ def make_states(
     )
     gravity = np.array([-sign, 0.15, 0.05]) + rng.normal(0, 0.03, 3)
     gravity /= np.linalg.norm(gravity)
-    points, volume, lobe = _by_lobe([tissue_points(region, spec.element / 2) for region in lobes.regions])
+    body = lung_body(patient, collapse, spec.element, rng)
+    poses = _poses(patient.scanned_centre, rng)
+    states, ends = [], []
+    for motion, held, pose in ((inflated_motion, True, poses[0]), (deflated_motion, False, poses[1])):
+        cavity, end = body.settle(motion, gravity, held, None if held else collapse.deflated)
+        ends.append(end)
+        states.append(State(lung, cavity, motion, end.state_from_ct, held, pose, body.tissue.points))
+    return (states[0], states[1]), gravity, ends
+
+
+@dataclass(frozen=True)
+class LungBody:
+    """The operated lung as a body that settles under loads. surface: points (n, 3) mm, areas (n,), lobes (n,); tied:
+    (n,) the tissue that belongs to the hilum."""
+
+    patient: Patient
+    tissue: Tissue
+    surface: tuple[Array, Array, Array]
+    tied: Array
+    element_mm: float
+
+    def settle(
+        self, motion: CageMotion, gravity: Array, held: bool, volume_ratio: float | None = None
+    ) -> tuple[Lattice, Equilibrium]:
+        """The lung's room after the walls' motion, as a signed distance (mm), and the lung at rest in it."""
+        lung, t = self.patient.lung, self.tissue
+        cavity = motion.carry(lung)
+        hilum = Hilum(t.points[self.tied], motion(t.points[self.tied]), 300.0, t.lobe[self.tied])
+        pleura = _pleura(self.surface, lung, cavity, held)
+        lobes = self.patient.lobes
+        return cavity, relax(t, pleura, hilum, gravity, motion, volume_ratio, self.element_mm, lobes)
+
+
+def lung_body(patient: Patient, collapse: Collapse, element_mm: float, rng: np.random.Generator) -> LungBody:
+    """The operated lung of a patient, pre-stressed to collapse so far and so unevenly."""
+    lobes = patient.lobes
+    points, volume, lobe = _by_lobe([tissue_points(region, element_mm / 2) for region in lobes.regions])
     surface = _by_lobe([surface_points(region, 2) for region in lobes.regions])
     tied = np.linalg.norm(points - patient.hilum, axis=1) < (20.0 if len(lobes.regions) == 1 else HINGE_MM)
     shear, slack = _uneven(patient, points, lobe, collapse, rng)
     rest = np.cbrt(np.clip(collapse.deflated * slack, 0.15, 0.95))
-    poses = _poses(patient.scanned_centre, rng)
-    states, ends = [], []
-    for motion, held, pose in ((inflated_motion, True, poses[0]), (deflated_motion, False, poses[1])):
-        cavity = motion.carry(lung)
-        end = relax(
-            Tissue(points, volume, shear, rest, 165.0, lobe),
-            _pleura(surface, lung, cavity, held),
-            Hilum(points[tied], motion(points[tied]), 300.0, lobe[tied]),
-            gravity,
-            motion,
-            None if held else collapse.deflated,
-            spec.element,
-            lobes,
-        )
-        ends.append(end)
-        states.append(State(lung, cavity, motion, end.state_from_ct, held, pose, points))
-    return (states[0], states[1]), gravity, ends
+    return LungBody(patient, Tissue(points, volume, shear, rest, 165.0, lobe), surface, tied, element_mm)
 
 
 def _by_lobe(parts: list[tuple[Array, Array]]) -> tuple[Array, Array, Array]:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from phantoms.anatomy import Build
+from phantoms.breathing import Breath, breathe, volume_signal
 from phantoms.case import PhantomCase, finish_case
 from phantoms.fields import Lattice, as_distance, lattice_over
 from phantoms.lobes import Fissures, Sheet, whole
@@ -37,23 +38,49 @@ class Scan:
     nodule: Mask | None = None
 
 
+@dataclass(frozen=True)
+class TwinBase:
+    """A scanned person in the frame of `anatomy`. origin: (3,) mm of that frame in the scan's; ct: with the nodule;
+    body: without the operated lung; lung: mask of that lung."""
+
+    patient: Patient
+    origin: Array
+    ct: Volume
+    body: Volume
+    lung: Mask
+
+
 def make_twin(scan: Scan, spec: PhantomSpec, seed: int = 0) -> PhantomCase:
     """The case of a scanned person; the lung is one piece, since a scan does not say where its lobes have grown
     together.
 
     Raises ValueError where the scan shows no place for the nodule, or too little of either lung.
     """
+    rng = np.random.default_rng([seed, 12])
+    base = twin_base(scan, spec, seed, rng)
+    table = make_states(base.patient, spec, rng)
+    marks = _corners(base.patient)
+    return _back(finish_case(base.patient, spec, seed, table, (base.ct, base.body, base.lung), marks, rng), base.origin)
+
+
+def make_breath(scan: Scan, side: str, count: int, least: float, seed: int = 0) -> tuple[Breath, Array]:
+    """`count` states of one breath of a scanned person, down to `least` of the lung's volume in the scan, and the
+    origin (3,) mm of their frame in the scan's. Raises as `make_twin`."""
+    rng = np.random.default_rng([seed, 13])
+    base = twin_base(scan, PhantomSpec("breath", side), seed, rng)
+    return breathe(base.patient, base.body, volume_signal(count, least), 18.0, rng), base.origin
+
+
+def twin_base(scan: Scan, spec: PhantomSpec, seed: int, rng: np.random.Generator) -> TwinBase:
+    """The person in a scan, with a nodule like that of `spec` put in where the scan has none."""
     origin, build = chest_frame(scan)
     scan = _shifted(scan, -origin)
-    rng = np.random.default_rng([seed, 12])
     patient = _patient(scan, build, spec, seed, rng)
     ct = Volume(scan.ct.hu.copy(), scan.ct.ras_from_ijk)
     if scan.nodule is None:
         paint_nodule(ct.hu, ct.grid, patient.nodule, float(ct.grid.spacing.mean()))
-    body = without_lung(scan.ct, scan.lungs[spec.side])
-    table = make_states(patient, spec, rng)
-    made = finish_case(patient, spec, seed, table, (ct, body, scan.lungs[spec.side]), _corners(scan, patient), rng)
-    return _back(made, origin)
+    lung = scan.lungs[spec.side]
+    return TwinBase(patient, origin, ct, without_lung(scan.ct, lung), lung)
 
 
 def chest_frame(scan: Scan) -> tuple[Array, Build]:
@@ -154,7 +181,7 @@ def without_lung(ct: Volume, lung: Mask) -> Volume:
     return Volume(hu, ct.ras_from_ijk)
 
 
-def _corners(scan: Scan, patient: Patient) -> Array:
+def _corners(patient: Patient) -> Array:
     """Points (n, 3) mm in the lung where vessels fork: peaks of how much the image changes in every direction.
 
     Ref: Foerstner 1987 (det / trace of the structure tensor).

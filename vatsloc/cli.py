@@ -130,19 +130,18 @@ def phantom(
 ) -> None:
     """Write a synthetic case with known truth, the whole suite with a table of how hard its cases are, or the twin of a
     scan: collapsed, or breathing."""
-    from vatsloc.phantom_case import write_phantom, write_twin
+    from vatsloc.phantom_case import side_named, write_phantom, write_twin
     from vatsloc.phantom_series import write_series
     from vatsloc.study.suite import table, write_suite
 
-    if side not in ("right", "left"):
-        raise CaseError(f'--side must be right or left, got "{side}".')
+    moving = side_named(side)
     if suite is not None and (name, out, from_ct) == (None, None, None):
         print(table(write_suite(suite, jobs, say)))
     elif suite is None and out is not None and from_ct is not None:
         if series is None:
-            write_twin(from_ct, side, out, name, seed, nodule, say)
+            write_twin(from_ct, moving, out, name, seed, nodule, say)
         else:
-            write_series(from_ct, side, out, series, seed, say)
+            write_series(from_ct, moving, out, series, seed, say)
         print(out)
     elif suite is None and from_ct is None and name is not None and out is not None:
         write_phantom(name, out, seed, say)

@@ -64,6 +64,14 @@ def write_twin(
         raise InputRefused(f"{ct}: {refusal}.") from refusal
 
 
+def side_named(side: str) -> Side:
+    """The side called so; raises CaseError for another word."""
+    sides: dict[str, Side] = {"right": "right", "left": "left"}
+    if side not in sides:
+        raise CaseError(f'--side must be right or left, got "{side}".')
+    return sides[side]
+
+
 def twin_spec(side: Side, name: str | None) -> PhantomSpec:
     """What a twin is made like: the phantom called `name`, on `side`. Raises CaseError for an unknown name."""
     if name is not None and name not in SPECS:
