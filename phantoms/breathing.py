@@ -28,7 +28,7 @@ Array = NDArray[Any]
 SUPINE = np.array([0.0, -1.0, 0.0])
 RIBS_MM = 4.0
 """How far the ribs of one side move in while the lung loses three tenths of its volume."""
-KNOTS = 5
+KNOTS = 4
 
 
 @dataclass(frozen=True)

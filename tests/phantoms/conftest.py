@@ -11,8 +11,8 @@ LOBED = PhantomSpec(
     "lobed",
     "right",
     ct_spacing=(3.0, 3.0, 3.0),
-    cbct_spacing=(2.5, 2.5, 2.5),
-    element=18.0,
+    cbct_spacing=(3.0, 3.0, 3.0),
+    element=20.0,
     fused=0.25,
     collapse=Collapse(lobes_apart=0.1),
 )
