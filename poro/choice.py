@@ -32,12 +32,19 @@ class Range:
 
 @dataclass(frozen=True)
 class Chosen:
-    """state: of the model that ran; why: one sentence; finite: the finite-strain run, None when none was needed."""
+    """state: of the model that ran; why: one sentence; share: of elements that the linear answer strains too far;
+    finite: the finite-strain run, None when none was needed.
+    """
 
     state: PoroState
     model: Model
     why: str
+    share: float
     finite: FiniteState | None
+
+    def entry(self) -> dict[str, str | float]:
+        """What a run's record says of it."""
+        return {"model": self.model.value, "why": self.why, "share_out_of_range": self.share}
 
 
 def finite_problem(system: PoroSystem, theta: Theta, law: Law) -> FiniteProblem:
@@ -54,20 +61,28 @@ def finite_problem(system: PoroSystem, theta: Theta, law: Law) -> FiniteProblem:
 
 def solve_in_range(system: PoroSystem, theta: Theta, law: Law, within: Range | None = None) -> Chosen:
     """Solve linearly, and again by `law` at finite strain when the linear answer leaves its range."""
+    return keep_in_range(system, solve(system, theta), law, within)
+
+
+def keep_in_range(system: PoroSystem, linear: PoroState, law: Law, within: Range | None = None) -> Chosen:
+    """The linear answer, for instance a fit's, where it is in its range; the same load by `law` where it is not.
+
+    Raises ValueError when it is not and the system carries load modes, which finite strain does not know.
+    """
     within = within or Range()
-    linear = solve(system, theta)
     share = float((linear.det_f < within.min_det).mean())
     told = f"{100 * share:.2f} % of the elements have det F below {within.min_det} under linear strain"
     allowed = f"{100 * within.share:.2f} % allowed"
     if share <= within.share:
-        return Chosen(linear, Model.LINEAR, f"linear strain: {told}, {allowed}", None)
-    finite = deform(finite_problem(system, theta, law))
+        return Chosen(linear, Model.LINEAR, f"linear strain: {told}, {allowed}", share, None)
+    finite = deform(finite_problem(system, linear.theta, law))
     if finite.status is FiniteStatus.STOPPED:
         why = (
             f"linear strain although {told}, {allowed}: {law.name} carried only {100 * finite.share:.0f} % of the load"
         )
-        return Chosen(linear, Model.LINEAR, why, finite)
-    return Chosen(_as_state(system, theta, linear, finite), Model.FINITE, f"{law.name}: {told}, {allowed}", finite)
+        return Chosen(linear, Model.LINEAR, why, share, finite)
+    state = _as_state(system, linear.theta, linear, finite)
+    return Chosen(state, Model.FINITE, f"{law.name}: {told}, {allowed}", share, finite)
 
 
 def _as_state(system: PoroSystem, theta: Theta, linear: PoroState, finite: FiniteState) -> PoroState:

@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose
 from shapes import ellipsoid
 
 from poro.assembly import deformation_gradient
-from poro.choice import Model, Range, finite_problem, solve_in_range
+from poro.choice import Model, Range, finite_problem, keep_in_range, solve_in_range
 from poro.finite import FiniteProblem, FiniteStatus, deform
 from poro.laws import neo_hookean
 from poro.model import PoroSystem, Theta, assemble, solve
@@ -77,6 +77,19 @@ def test_collapsed_lungs_go_finite_and_hold_signorini(system: PoroSystem) -> Non
     assert chosen.finite is not None
     assert chosen.finite.residuals[-1] < 1e-8
     assert state.det_f @ system.mesh.volumes > solve(system, theta).det_f @ system.mesh.volumes
+
+
+def test_a_solved_lung_is_kept_as_it_is_or_solved_again(system: PoroSystem) -> None:
+    linear = solve(system, Theta(1e-8, 0.8, 2.0))
+    kept = keep_in_range(system, linear, LAW, Range(min_det=linear.det_f.min()))
+    assert kept.state is linear
+    assert kept.entry() == {"model": "linear strain", "why": kept.why, "share_out_of_range": 0.0}
+    bound = float(np.quantile(linear.det_f, 0.25))
+    again = keep_in_range(system, linear, LAW, Range(min_det=bound))
+    assert again.state.theta is linear.theta
+    assert again.entry()["model"] == "finite strain"
+    assert again.entry()["share_out_of_range"] == pytest.approx(0.25, abs=1 / len(linear.det_f))
+    assert 0.1 < np.linalg.norm(again.state.u - linear.u, axis=1).max() < 10
 
 
 def test_load_modes_are_refused(system: PoroSystem) -> None:
