@@ -61,9 +61,18 @@ def group_springs(compliance: Compliance, points: Array, force: Array, hessian: 
     keep = np.abs(flat) > SPRING_CUT * np.abs(flat).max(initial=0)
     which = np.repeat(np.arange(count), 3)[keep]
     along = vectors.transpose(0, 2, 1).reshape(-1, 3)[keep]
-    mean = groups.mean.transpose(0, 2, 1, 3)[which[:, None], which]
-    matrix = np.einsum("ra,rsab,sb->rs", along, mean, along, optimize=True) + np.diag(1 / flat[keep])
-    return Springs(groups, which, along, matrix)
+    return Springs(groups, which, along, _among(groups.mean, which, along) + np.diag(1 / flat[keep]))
+
+
+@njit(cache=True)
+def _among(mean: Array, which: Array, along: Array) -> Array:
+    result = np.zeros((len(which), len(which)))
+    for r in range(len(which)):
+        for s in range(len(which)):
+            for a in range(3):
+                for b in range(3):
+                    result[r, s] += along[r, a] * mean[which[r], a, which[s], b] * along[s, b]
+    return result
 
 
 @njit(cache=True)

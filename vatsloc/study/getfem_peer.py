@@ -24,8 +24,8 @@ _AUGMENTATION = 0.1  # kPa/mm, about the tissue's stiffness over an element; any
 
 @dataclass(frozen=True)
 class GetfemAnswer:
-    """GetFEM's solutions of k cases. free, contact: (k, n, 3) mm without and with wall; free_s, contact_s: (k,) seconds
-    from the mesh with its fields on; mesh_s: seconds to read the mesh; steps: (k,) Newton steps with wall.
+    """GetFEM's solutions of k cases. free, contact: (k, n, 3) mm without and with wall; free_s, contact_s: (k,) CPU
+    seconds from the mesh with its fields on; mesh_s: those to read the mesh; steps: (k,) Newton steps with wall.
     """
 
     free: Array
