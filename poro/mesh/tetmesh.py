@@ -117,8 +117,9 @@ class Quality:
 
 def signed_volumes(points: Array, tets: Array) -> Array:
     """Signed volumes (m,) of tetrahedra (m, 4) over points (n, 3)."""
-    x = points[tets]
-    return np.linalg.det(x[:, 1:] - x[:, :1]) / 6
+    x, y, z = (points[:, axis][tets] for axis in range(3))
+    (x1, x2, x3), (y1, y2, y3), (z1, z2, z3) = ((q[:, 1:] - q[:, :1]).T for q in (x, y, z))
+    return np.asarray(x1 * (y2 * z3 - y3 * z2) + y1 * (z2 * x3 - z3 * x2) + z1 * (x2 * y3 - x3 * y2)) / 6
 
 
 def surface(mesh: TetMesh) -> TriSurface:
