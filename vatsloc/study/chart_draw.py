@@ -129,7 +129,7 @@ def _panel(axes: Any, panel: Sequence[Point], phase: str, measure: str) -> None:
             _label(axes, published.says, where, GREEN, (0, 8), "center")
     axes.set(xscale="log", yscale="log", title=f"{PHASE_TITLES[phase]}, {MEASURES[measure]}")
     axes.set(ylabel="target registration error, mm")
-    axes.margins(x=0.18, y=0.12)
+    axes.margins(x=0.24, y=0.12)
     shown_s = [s for s in TICKS_S if axes.get_xlim()[0] <= s <= axes.get_xlim()[1]]
     axes.set_xticks(shown_s, [TICKS_S[s] for s in shown_s])
     shown_mm = [mm for mm in TICKS_MM if axes.get_ylim()[0] <= mm <= axes.get_ylim()[1]]
