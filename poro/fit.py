@@ -37,7 +37,7 @@ class FitSettings:
     surface_sigma_mm, keypoint_sigma_mm: standard deviations of one observation; correlation_mm: surface points closer
     than this count as one; robust: residual, in standard deviations, from which influence falls off (Cauchy),
     infinite for none; plain: the paper's nearest-node cost; free: which entries of theta and the modes may move, all
-    when None.
+    when None; starts: (kappa_b, phi, d_diaph_mm, amplitudes of the modes or none of them).
     """
 
     surface_sigma_mm: float = 2.0
@@ -48,7 +48,7 @@ class FitSettings:
     free: tuple[bool, ...] | None = None
     max_steps: int = 30
     tolerance: float = 1e-3
-    starts: tuple[tuple[float, float, float], ...] = ((1e-8, 0.8, 0.0),)
+    starts: tuple[tuple[float, ...], ...] = ((1e-8, 0.8, 0.0),)
 
 
 class FitStatus(Enum):
@@ -158,7 +158,8 @@ def fit(
     for number, start in enumerate(settings.starts):
         if progress:
             progress("fit", number / len(settings.starts))
-        runs.append(_descend(problem, np.array([np.log10(start[0]), *start[1:], *np.zeros(len(system.modes))])))
+        modes = start[3:] or np.zeros(len(system.modes))
+        runs.append(_descend(problem, np.array([np.log10(start[0]), *start[1:3], *modes])))
     theta, state, history, settled = min(runs, key=lambda run: run[2][-1].cost)
     status = FitStatus.CONVERGED if settled else FitStatus.STOPPED
     if state.status is PoroStatus.NOT_SETTLED:

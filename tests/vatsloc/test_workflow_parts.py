@@ -13,7 +13,7 @@ from registration.volume import Grid
 from vatsloc.errors import CaseError, InputRefused
 from vatsloc.maps import MeshMap, covered, sampled
 from vatsloc.workflow.gates import at_least, at_most
-from vatsloc.workflow.pneumothorax import hand_placed
+from vatsloc.workflow.observe import hand_placed
 from vatsloc.workflow.settings import load_settings
 from vatsloc.workflow.stages import Stages
 

@@ -112,11 +112,11 @@ def nodule_ellipsoid(pose: ChangeOfPose, collapse: Collapse, nodule_inf: Array) 
 def quality_gates(pose: ChangeOfPose, collapse: Collapse, limits: GateSettings) -> dict[str, Gate]:
     """Every check of a run but the nodule's own, by name."""
     gates: dict[str, Gate] = {}
-    for name, rigid in (("ct_inflated", pose.rigid), ("inflated_deflated", collapse.rigid)):
+    for name, rigid in (("ct_inflated", pose.rigid), ("inflated_deflated", collapse.observed.rigid)):
         gates |= _spine_gates(name, rigid, limits)
     after = collapse.mesh_after
     inverted = float((signed_volumes(after.points, after.tets) <= 0).mean())
-    air, fissure = (len(collapse.surface.only(border)) for border in (Border.AIR, Border.FISSURE))
+    air, fissure = (len(collapse.observed.surface.only(border)) for border in (Border.AIR, Border.FISSURE))
     gates |= {
         "overlap": at_least(pose.overlap, limits.min_overlap, "The inflated CBCT shows too little of the lung."),
         "inverted_elements": at_most(inverted, limits.max_inverted_elements, "The collapse turns elements inside out."),
@@ -149,7 +149,7 @@ def quality_gates(pose: ChangeOfPose, collapse: Collapse, limits: GateSettings) 
 
 def surface_distances(collapse: Collapse) -> Array:
     """Distances (n,) in mm of the observed air border from the collapsed mesh, one infinite one where none was seen."""
-    points = collapse.surface.only(Border.AIR).points
+    points = collapse.observed.surface.only(Border.AIR).points
     if len(points) == 0:
         return np.array([np.inf])
     return np.asarray(np.abs(closest_points(collapse.mesh_after.boundary, points).distance))
@@ -164,11 +164,11 @@ def _spine_gates(name: str, rigid: RigidFit, limits: GateSettings) -> dict[str, 
 
 
 def _note(pose: ChangeOfPose, collapse: Collapse, stages: Stages) -> None:
-    if collapse.motion.source in (HilumSource.SHIFT, HilumSource.STILL):
-        stages.warn(f"The hilum's motion comes from {collapse.motion.source.value}.")
+    if collapse.observed.motion.source in (HilumSource.SHIFT, HilumSource.STILL):
+        stages.warn(f"The hilum's motion comes from {collapse.observed.motion.source.value}.")
     if collapse.residual is None and "residual registration" not in stages.skipped:
         stages.warn("Too little lung is seen in both CBCTs to correct the model by what they show inside it.")
-    if not collapse.found.is_collapsed:
+    if not collapse.observed.found.is_collapsed:
         stages.warn("The deflated CBCT shows hardly any pleural air, so the lung may not have collapsed.")
     if pose.ffd is not None and pose.seen.all():
         stages.skip("extrapolation", "the inflated CBCT shows the whole lung")

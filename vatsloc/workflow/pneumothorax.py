@@ -4,26 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
-from poro.fit import Fit, FitSettings, fit
-from poro.mesh import TetMesh, TriSurface, interpolate, locate, stuff
-from poro.model import PoroSystem, assemble
-from poro.observations import Target
-from poro.tissue import Tissue
-from registration.resample import resample_mask
+from poro.fit import Fit
+from poro.mesh import TetMesh, TriSurface, interpolate, locate
+from poro.model import PoroSystem
 from registration.rigid import RigidTransform
-from registration.spine import RigidFit, register_spine
 from registration.volume import Array
 from vatsloc.case import Case
-from vatsloc.imaging.hilum import Hilum, find_hilum
-from vatsloc.imaging.lattice import working_copy
-from vatsloc.imaging.pleura import Pneumothorax, find_pneumothorax
-from vatsloc.imaging.surface import Border, SurfacePoints, deflated_surface
-from vatsloc.imaging.thorax import SPACING_MM, ThoraxPrior
-from vatsloc.maps import MeshMap, covered, sampled
-from vatsloc.workflow.hilum import HilumMotion, HilumSource, hilum_motion
-from vatsloc.workflow.pose import ChangeOfPose, as_side
+from vatsloc.maps import MeshMap
+from vatsloc.workflow.ladder import Model, climb
+from vatsloc.workflow.observe import Observed, observe
+from vatsloc.workflow.pose import ChangeOfPose
 from vatsloc.workflow.prepare import Prepared
 from vatsloc.workflow.residual import Residual, residual_registration
 from vatsloc.workflow.settings import Settings
@@ -34,32 +24,39 @@ from vatsloc.workflow.stages import Stages
 class Collapse:
     """The lung after its collapse, in the deflated CBCT's frame.
 
-    mesh_before, points_after: the change of pose's tetrahedra, placed by the spine and then collapsed; system, fit: of
-    the model's own, coarser mesh; residual: what images added to the model, in points_after already; surface: what was
-    seen of the collapsed lung; hilum_nodes: (k,) held nodes of the model.
+    model: what mechanics made of the observations; residual: what images added to it; points_after: (n, 3) mm, nodes of
+    `observed.mesh_before` after both.
     """
 
-    rigid: RigidFit
-    found: Pneumothorax
-    surface: SurfacePoints
-    hilum: Hilum
-    hilum_nodes: Array
-    motion: HilumMotion
-    mesh_before: TetMesh
-    points_after: Array
-    system: PoroSystem
-    fit: Fit
+    observed: Observed
+    model: Model
     residual: Residual | None
+    points_after: Array
 
     @property
     def def_from_inf_rigid(self) -> RigidTransform:
         """Rigid part, inflated to deflated CBCT."""
-        return self.rigid.moving_from_fixed.inverse()
+        return self.observed.def_from_inf_rigid
+
+    @property
+    def mesh_before(self) -> TetMesh:
+        """The lung before, placed by the spine."""
+        return self.observed.mesh_before
 
     @property
     def mesh_after(self) -> TetMesh:
         """The collapsed lung."""
         return TetMesh(self.points_after, self.mesh_before.tets)
+
+    @property
+    def system(self) -> PoroSystem:
+        """The model's lung."""
+        return self.model.system
+
+    @property
+    def fit(self) -> Fit:
+        """The model's parameters."""
+        return self.model.fit
 
     def on_lung(self, nodal: Array) -> Array:
         """A nodal field of the model's mesh on the nodes of the lung's."""
@@ -67,111 +64,34 @@ class Collapse:
 
 
 def pneumothorax(case: Case, prepared: Prepared, pose: ChangeOfPose, settings: Settings, stages: Stages) -> Collapse:
-    """Register the spine, find the collapsed lung's surface and hilum, and fit the poroelastic model to them."""
-    with stages.stage("spine inflated to deflated"):
-        rigid = register_spine(
-            prepared.deflated.volume,
-            prepared.inflated.volume,
-            prepared.spine_deflated.mask,
-            prepared.spine_inflated.mask,
-            fixed_seen=prepared.deflated.field.usable,
-            moving_seen=prepared.inflated.field.usable,
-        )
-    def_from_inf = rigid.moving_from_fixed.inverse()
-    before = TetMesh(def_from_inf(pose.points_inf), pose.mesh_ct.tets)
-    with stages.stage("deflated surface"):
-        prior = _prior(prepared, pose, def_from_inf, case.side)
-        found = find_pneumothorax(prepared.deflated, prior)
-        surface = _hinted_surface(case) or deflated_surface(found, prepared.deflated.field)
-    with stages.stage("hilum"):
-        hilum_ct = find_hilum(prepared.lung_ct, prepared.lungs.airways, as_side(case.side))
-        to_def = MeshMap(pose.mesh_ct, before.points, def_from_inf @ pose.inf_from_ct_rigid)
-        hilum = Hilum(to_def(hilum_ct.point_ras[None])[0], hilum_ct.radius_mm, hilum_ct.on_airways)
-        coarse = stuff(prepared.lung_ct.inside, prepared.lung_ct.ras_from_ijk, settings.mesh.model_edge_mm)
-        model_mesh = TetMesh(to_def(coarse.points), coarse.tets)
-        nodes = _held(model_mesh, hilum.point_ras, settings.model.hilum_radius_mm)
-        motion = _motion(prepared, prior, hilum, def_from_inf, model_mesh.points[nodes], settings)
-    with stages.stage("model set-up"):
-        system = assemble(model_mesh, Tissue(), case.gravity_ras, nodes, motion.displacement)
-    with stages.stage("fit"):
-        result = fit(system, _target(surface), _fit_settings(settings))
-    after = before.points + interpolate(locate(model_mesh, before.points), result.state.u)
-    residual = None
-    if settings.residual.on:
-        with stages.stage("residual registration"):
-            model = MeshMap(pose.mesh_inf, after, def_from_inf)
-            images = prepared.inflated, prepared.deflated
-            residual = residual_registration(*images, found.lung, model, before, surface, settings.residual)
-        after = after if residual is None else after + residual.displacement
-    else:
+    """See what there is of the collapsed lung, fit the poroelastic model to it, correct that by the images inside."""
+    observed = observe(case, prepared, pose, settings, stages)
+    return collapse(case, prepared, pose, observed, settings, stages)
+
+
+def collapse(
+    case: Case, prepared: Prepared, pose: ChangeOfPose, observed: Observed, settings: Settings, stages: Stages
+) -> Collapse:
+    """The part of `pneumothorax` that follows the observations."""
+    model = climb(case.gravity_ras, prepared, observed, settings, stages)
+    before = observed.mesh_before
+    after = before.points + interpolate(locate(observed.model_mesh, before.points), model.displacement)
+    if not settings.residual.on:
         stages.skip("residual registration", "switched off in the settings")
-    return Collapse(rigid, found, surface, hilum, nodes, motion, before, after, system, result, residual)
+        return Collapse(observed, model, None, after)
+    with stages.stage("residual registration"):
+        residual = residual_registration(
+            prepared.inflated,
+            prepared.deflated,
+            observed.found.lung,
+            MeshMap(pose.mesh_inf, after, observed.def_from_inf_rigid),
+            before,
+            observed.surface,
+            settings.residual,
+        )
+    return Collapse(observed, model, residual, after if residual is None else after + residual.displacement)
 
 
 def contact_surface(collapse: Collapse) -> TriSurface:
     """What the collapsing lung may not pass: its own surface before the collapse."""
     return collapse.mesh_before.boundary
-
-
-def _prior(prepared: Prepared, pose: ChangeOfPose, def_from_inf: RigidTransform, side: str) -> ThoraxPrior:
-    """Where the inflated lung, the other one and the airways lie in the deflated CBCT's frame, by the spine alone."""
-    coarse = working_copy(prepared.deflated.volume, SPACING_MM).grid
-    rigid = def_from_inf @ pose.inf_from_ct_rigid
-    here = MeshMap(pose.mesh_ct, def_from_inf(pose.points_inf), rigid)
-    ct_from_def = sampled(here.inverse(), coarse.with_spacing(4.0))
-    other = prepared.lungs.left if side == "right" else prepared.lungs.right
-    return ThoraxPrior(
-        covered(TetMesh(here.moved, pose.mesh_ct.tets), coarse),
-        resample_mask(other, coarse, rigid.inverse()),
-        resample_mask(prepared.lungs.airways, coarse, ct_from_def),
-    )
-
-
-def _held(mesh: TetMesh, hilum: Array, radius_mm: float) -> Array:
-    """Nodes within `radius_mm` of the hilum; at least the twelve nearest."""
-    far = np.linalg.norm(mesh.points - hilum, axis=1)
-    nodes = np.flatnonzero(far <= radius_mm)
-    return nodes if len(nodes) >= 12 else np.sort(np.argsort(far)[:12])
-
-
-def _motion(
-    prepared: Prepared,
-    prior: ThoraxPrior,
-    hilum: Hilum,
-    def_from_inf: RigidTransform,
-    points: Array,
-    settings: Settings,
-) -> HilumMotion:
-    if not settings.model.hilum:
-        return HilumMotion(np.zeros_like(points), HilumSource.OFF)
-    return hilum_motion(prepared.inflated, prepared.deflated, prior.airways, hilum, def_from_inf.inverse(), points)
-
-
-def _target(surface: SurfacePoints) -> Target:
-    """What the model is compared with; a one-piece lung has no fissures, so those points are left out."""
-    outer = surface.only(Border.AIR, Border.CONTACT, Border.DENSE)
-    return Target(outer.points, outer.normals, outer.confidence)
-
-
-def _fit_settings(settings: Settings) -> FitSettings:
-    plain = settings.model.cost == "plain"
-    free = (True, True, settings.model.diaphragm)
-    return FitSettings(plain=plain, free=free, max_steps=settings.model.max_steps)
-
-
-def _hinted_surface(case: Case) -> SurfacePoints | None:
-    """Points by hand instead of found ones, all equally sure; None without the hint."""
-    hint = case.hints.deflated_surface
-    if hint is None:
-        return None
-    return hand_placed(hint.points_ras, hint.triangles)
-
-
-def hand_placed(points: Array, triangles: Array) -> SurfacePoints:
-    """Surface points from an STL (vertices with their normals) or from bare points (normals away from their middle)."""
-    if len(triangles):
-        normals = TriSurface(points, triangles, np.arange(len(points))).node_normals
-    else:
-        normals = points - points.mean(axis=0)
-        normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
-    return SurfacePoints(points, normals, np.ones(len(points)), np.full(len(points), Border.AIR, dtype=np.int8))

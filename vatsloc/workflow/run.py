@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -185,12 +185,12 @@ def _record(case: Case, found: Localization, settings: Settings, stages: Stages)
 def _residuals(found: Localization) -> dict[str, Any]:
     """What each solver left over, with its own word on how it ended."""
     pose, collapse = found.pose, found.collapse
-    state = collapse.fit.state
+    state, motion = collapse.fit.state, collapse.observed.motion
     return {
         "spine_ct_inflated": _spine(pose.rigid),
-        "spine_inflated_deflated": _spine(collapse.rigid),
+        "spine_inflated_deflated": _spine(collapse.observed.rigid),
         **_change_of_pose(pose),
-        "hilum": {"source": collapse.motion.source.value, "mean_mm": collapse.motion.displacement.mean(axis=0)},
+        "hilum": {"source": motion.source.value, "mean_mm": motion.displacement.mean(axis=0)},
         "fit": {
             "status": collapse.fit.status.value,
             "steps": len(collapse.fit.history),
@@ -200,6 +200,8 @@ def _residuals(found: Localization) -> dict[str, Any]:
             "min_det": state.det_f.min(),
             "volume_ratio": collapse.mesh_after.volumes.sum() / collapse.mesh_before.volumes.sum(),
         },
+        "keypoints": {"found": len(collapse.model.pairs), "held_back_mm": collapse.model.held_back_mm},
+        "ladder": [asdict(rung) for rung in collapse.model.rungs],
         "residual_registration": _corrected(collapse.residual),
         "surface_mm": {f"p{share}": np.percentile(surface_distances(collapse), share) for share in (50, 75, 90, 95)},
         "mesh": {"tetrahedra": len(pose.mesh_ct.tets), "model_tetrahedra": len(collapse.system.mesh.tets)},
@@ -257,6 +259,6 @@ def _pictures(case: Case, found: Localization) -> tuple[Picture, ...]:
             "What the model is fitted to: the lung beside the pleural air in the deflated CBCT.",
             prepared.deflated.volume,
             found.nodule_def,
-            (Outline("collapsed lung", SURFACE, collapse.found.lung),),
+            (Outline("collapsed lung", SURFACE, collapse.observed.found.lung),),
         ),
     )

@@ -39,13 +39,28 @@ class MeshSettings(_Table):
 
 
 class ModelSettings(_Table):
-    """Phase 2. cost: "plain" is the paper's; hilum, diaphragm: its variants leave one out."""
+    """Phase 2. cost: "plain" is the paper's; hilum, diaphragm: its variants leave one out; regional, correct: rungs
+    beyond the paper, tried where keypoints can say whether they help.
+    """
 
     cost: Literal["surface", "plain"] = "surface"
     hilum: bool = True
     diaphragm: bool = True
+    regional: bool = True
+    correct: bool = True
     hilum_radius_mm: float = Field(default=15.0, gt=0)
     max_steps: int = Field(default=30, ge=1)
+
+
+class KeypointSettings(_Table):
+    """Places inside the lung, found again between the cone-beam CTs. Lengths in mm; reach_mm: how far off along each
+    axis the model may be; sigma_mm: standard deviation of one.
+    """
+
+    on: bool = True
+    voxel_mm: float = Field(default=2.0, ge=1, le=4)
+    reach_mm: float = Field(default=14.0, ge=4, le=40)
+    sigma_mm: float = Field(default=2.0, gt=0)
 
 
 class ResidualSettings(_Table):
@@ -82,6 +97,7 @@ class Settings(_Table):
     registration: RegistrationSettings = RegistrationSettings()
     mesh: MeshSettings = MeshSettings()
     model: ModelSettings = ModelSettings()
+    keypoints: KeypointSettings = KeypointSettings()
     residual: ResidualSettings = ResidualSettings()
     gates: GateSettings = GateSettings()
 
