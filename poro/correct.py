@@ -116,25 +116,3 @@ def correct(
 def _near(where: Location) -> Array:
     """1 in the mesh, falling off over a few millimetres outside it."""
     return 1 / (1 + (where.distance / 3.0) ** 2)
-
-
-def held_out(
-    mesh: TetMesh, u: Array, tissue: Tissue, pull: Pull, model_sigma: float = 0.05, folds: int = 4
-) -> tuple[float, float]:
-    """Median misfit in mm at inner points, without any correction and with one that has not seen them.
-
-    A correction whose second figure is not the smaller should be dropped. Raises ValueError for fewer points than
-    folds.
-    """
-    inner = np.flatnonzero(np.linalg.norm(pull.normals, axis=1) < 0.5)
-    if len(inner) < folds:
-        raise ValueError(f"{len(inner)} inner points, {folds} needed to hold some back")
-    operator = point_operator(locate(mesh, pull.points), len(u))
-    after = np.zeros(len(inner))
-    for fold in range(folds):
-        hidden = inner[fold::folds]
-        seen = np.setdiff1d(np.arange(len(pull.points)), hidden)
-        part = Pull(pull.points[seen], pull.offset[seen], pull.sigma_mm[seen], pull.normals[seen])
-        field = correct(mesh, u, tissue, part, model_sigma).u
-        after[fold::folds] = np.linalg.norm(pull.offset[hidden] - operator[hidden] @ field, axis=1)
-    return float(np.median(np.linalg.norm(pull.offset[inner], axis=1))), float(np.median(after))

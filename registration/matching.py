@@ -28,7 +28,7 @@ class MatchSettings:
 
     voxel_mm: float = 2.0
     cell_mm: float = 10.0
-    radius: int = 4
+    radius: int = 3
     reach_mm: float = 14.0
     least_ncc: float = 0.6
     round_trip_mm: float = 2.0
@@ -109,8 +109,7 @@ def _distinctive(image: Volume, allowed: Array, settings: MatchSettings) -> Arra
     edge = settings.radius + 1
     inner = np.zeros(score.shape, bool)
     inner[edge:-edge, edge:-edge, edge:-edge] = True
-    peak = score >= ndimage.maximum_filter(score, 3)
-    ijk = np.argwhere(peak & inner & (score > 0))
+    ijk = np.argwhere(inner & (score > 0))
     value = score[tuple(ijk.T)]
     cell = np.floor(ijk * image.grid.spacing / settings.cell_mm).astype(np.int64) @ np.array([1, 1 << 20, 1 << 40])
     order = np.argsort(-value, kind="stable")
@@ -147,7 +146,8 @@ def _between(scores: Array, shift: Array) -> tuple[Array, Array]:
     hessian = np.stack([k[:, [4, 7, 8]], k[:, [7, 5, 9]], k[:, [8, 9, 6]]], axis=1)
     known = inside & (around > -1).all(axis=1) & (np.linalg.eigvalsh(hessian)[:, -1] < -1e-6)
     result = np.zeros(shift.shape)
-    result[known] = np.clip(-np.linalg.solve(hessian[known], k[known, 1:4, None])[..., 0], -1, 1)
+    result[known] = -np.linalg.solve(hessian[known], k[known, 1:4, None])[..., 0]
+    known &= np.abs(result).max(axis=1) <= 1
     return result, known
 
 

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from numpy.testing import assert_allclose
 from shapes import ellipsoid
 
-from poro.correct import Pull, correct, held_out, pull_of
+from poro.correct import Pull, correct, pull_of
 from poro.mesh import interpolate, locate
 from poro.observations import Target
 from poro.tissue import Tissue
@@ -35,18 +34,6 @@ def test_correction_recovers_a_smooth_residual_and_ignores_outliers() -> None:
     assert (found.influence[:10] < 0.2).all()
     assert (found.influence[10:] > 0.5).mean() > 0.9
     assert found.det_f.min() > 0.5
-    without, with_it = held_out(mesh, u, TISSUE, pull)
-    assert with_it < 0.4 * without
-    assert without == pytest.approx(np.median(np.linalg.norm(hidden(inside[10:]), axis=1)), rel=0.2)
-
-
-def test_noise_alone_is_not_worth_a_correction() -> None:
-    mesh = ellipsoid(12.0)
-    rng = np.random.default_rng(9)
-    x = rng.uniform(-25, 25, (80, 3))
-    pull = Pull(x, rng.normal(size=(80, 3)) * 2, np.full(80, 1.0), np.zeros((80, 3)))
-    without, with_it = held_out(mesh, np.zeros_like(mesh.points), TISSUE, pull)
-    assert with_it > 0.9 * without
 
 
 def test_normal_springs_leave_sliding_free() -> None:

@@ -22,8 +22,8 @@ def test_a_shifted_image_gives_pairs_that_differ_by_the_shift(shift_ras: tuple[f
     pairs = match_keypoints(first, second, EVERYWHERE)
     assert len(pairs) > 40
     error = np.linalg.norm(pairs.first - pairs.second - shift, axis=1)
-    assert np.median(error) < 0.4  # a fifth of a voxel
-    assert error.max() < 1.0
+    assert np.median(error) < 0.5  # a quarter of a voxel
+    assert error.max() < 2.0
 
 
 def test_brightness_and_contrast_do_not_matter() -> None:

@@ -19,13 +19,13 @@ from poro.modes import hilum_modes, shape_modes
 from poro.observations import Target
 from poro.tissue import Tissue
 from registration.matching import MatchSettings, Pairs, match_keypoints
-from registration.resample import resample, resample_mask
+from registration.resample import coarsen, resample, resample_mask
 from registration.volume import Array, Mask
 from vatsloc.imaging.surface import Border, SurfacePoints
 from vatsloc.maps import MeshMap, covered, sampled
 from vatsloc.workflow.observe import Observed
 from vatsloc.workflow.prepare import Prepared
-from vatsloc.workflow.settings import Settings
+from vatsloc.workflow.settings import KeypointSettings, Settings
 from vatsloc.workflow.stages import Stages
 
 PRIOR_SPACING_MM = 3.0
@@ -33,7 +33,7 @@ BLOCK_MM = 40.0
 """Keypoints are held back by blocks this wide: neighbours tell nearly the same."""
 LEAST_PAIRS = 40
 CORRECTION_STRAINS = (0.05, 0.025, 0.0125)
-LEAST_DET = 0.05
+MOST_INVERTED = 0.001
 GAIN = 0.95
 """A rung has to bring the misfit below this share of the one before."""
 
@@ -67,8 +67,8 @@ class Model:
     @property
     def held_back_mm(self) -> float | None:
         """Median misfit at places held back from the last rung that was kept; None without keypoints."""
-        kept = [rung.after_mm if rung.kept else rung.before_mm for rung in self.rungs]
-        return kept[-1] if kept else None
+        kept = [rung.after_mm for rung in self.rungs if rung.kept] + [rung.before_mm for rung in self.rungs[:1]]
+        return min(kept, default=None)
 
 
 Step = Callable[[Model, Target, Fit], Model]
@@ -88,41 +88,58 @@ def climb(gravity: Array, prepared: Prepared, observed: Observed, settings: Sett
         stages.skip("keypoints", "switched off in the settings")
         return model
     with stages.stage("keypoints"):
-        pairs = inner_pairs(prepared, observed, model.displacement, settings)
-    if len(pairs) < LEAST_PAIRS:
-        stages.skip("regional fit", f"only {len(pairs)} places inside the lung were found again")
-        return replace(model, pairs=pairs)
-    hidden = held_back(pairs.second)
-    if not hidden.any() or hidden.all():
-        stages.skip("regional fit", "the places found again lie too close together to hold some back")
-        return replace(model, pairs=pairs)
-    steps: dict[str, Step] = {}
+        model = replace(model, pairs=inner_pairs(prepared, observed, model.displacement, settings.keypoints))
+    why = _too_few(model.pairs)
+    if why:
+        stages.skip("regional fit", why)
+        return model
+    blind = model
     if settings.model.regional:
-        steps["regional fit"] = _regional(gravity, settings)
-    if settings.model.correct:
-        steps["elastic correction"] = _corrected
-    return _climbed(replace(model, pairs=pairs), surface, hidden, steps, stages)
+        with stages.stage("regional fit"):
+            model, blind = best_of({"regional fit": _regional(gravity, settings)}, model, blind, surface)
+        if model.rungs[-1].kept:
+            with stages.stage("keypoints again"):
+                pairs = inner_pairs(prepared, observed, model.displacement, settings.keypoints)
+                model, blind = replace(model, pairs=pairs), replace(blind, pairs=pairs)
+    if settings.model.correct and not _too_few(model.pairs):
+        with stages.stage("elastic correction"):
+            steps = {f"elastic correction, strain {strain:g}": corrected(strain) for strain in CORRECTION_STRAINS}
+            model, _ = best_of(steps, model, blind, surface)
+    return model
 
 
-def _climbed(model: Model, surface: Target, hidden: Array, steps: dict[str, Step], stages: Stages) -> Model:
-    """Every step is first tried without the hidden pairs; those that predict them better are taken with all pairs."""
-    blind, rungs = model, []
-    for name, step in steps.items():
-        with stages.stage(name):
-            mesh, unseen = model.system.mesh, model.pairs.only(hidden)
-            trial = step(blind, _with(surface, model.pairs.only(~hidden)), blind.fit)
-            before, after = (misfit(mesh, one.displacement, unseen) for one in (blind, trial))
-            rungs.append(Rung(name, before, after, after < GAIN * before))
-            if rungs[-1].kept:
-                blind = trial
-                model = step(model, _with(surface, model.pairs), trial.fit)
-    return replace(model, rungs=tuple(rungs))
+def best_of(steps: dict[str, Step], model: Model, blind: Model, surface: Target) -> tuple[Model, Model]:
+    """Steps are first tried on the model that has not seen the hidden pairs. The one that predicts them best is taken,
+    if that is better than without, and taken again with all pairs for the model proper.
+    """
+    mesh, hidden = model.system.mesh, held_back(model.pairs.second)
+    unseen, shown = model.pairs.only(hidden), _with(surface, model.pairs.only(~hidden))
+    trials = {name: step(blind, shown, blind.fit) for name, step in steps.items()}
+    before = misfit(mesh, blind.displacement, unseen)
+    after = {name: misfit(mesh, trial.displacement, unseen) for name, trial in trials.items()}
+    best = min(after, key=lambda name: after[name])
+    taken = after[best] < GAIN * before
+    rungs = (*model.rungs, *(Rung(name, before, mm, taken and name == best) for name, mm in after.items()))
+    if taken:
+        blind = trials[best]
+        model = steps[best](model, _with(surface, model.pairs), blind.fit)
+    return replace(model, rungs=rungs), blind
+
+
+def _too_few(pairs: Pairs) -> str | None:
+    """Why pairs cannot judge a rung; None when they can."""
+    hidden = held_back(pairs.second)
+    if len(pairs) < LEAST_PAIRS:
+        return f"only {len(pairs)} places inside the lung were found again"
+    if min(hidden.sum(), (~hidden).sum()) < LEAST_PAIRS // 4:
+        return "the places found again lie too close together to hold some back"
+    return None
 
 
 NO_PAIRS = Pairs(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
 
 
-def inner_pairs(prepared: Prepared, observed: Observed, displacement: Array, settings: Settings) -> Pairs:
+def inner_pairs(prepared: Prepared, observed: Observed, displacement: Array, settings: KeypointSettings) -> Pairs:
     """Places inside the lung that both CBCTs show, looked for about where a displacement (n, 3) mm puts them.
 
     `first` is where they lie before the collapse, placed by the spine.
@@ -130,20 +147,19 @@ def inner_pairs(prepared: Prepared, observed: Observed, displacement: Array, set
     rest = observed.model_mesh
     moved = TetMesh(rest.points + displacement, rest.tets)
     rigid = observed.def_from_inf_rigid
-    grid = prepared.deflated.volume.grid
+    voxel = settings.voxel_mm
+    deflated, inflated = (coarsen(image.volume, voxel) for image in (prepared.deflated, prepared.inflated))
+    grid = deflated.grid
     inf_from_def = MeshMap(moved, rigid.inverse()(rest.points), rigid.inverse())
     prior = sampled(inf_from_def, grid.with_spacing(PRIOR_SPACING_MM))
-    warped = resample(prepared.inflated.volume, grid, prior)
-    both = resample_mask(prepared.inflated.field.usable, grid, prior).inside & prepared.deflated.field.usable.inside
-    lung = resample_mask(observed.found.lung, grid).inside
-    expected = covered(moved, grid).inside & both
-    match = MatchSettings(voxel_mm=settings.keypoints.voxel_mm, reach_mm=settings.keypoints.reach_mm)
+    seen = resample_mask(prepared.deflated.field.usable, grid).inside
+    both = resample_mask(prepared.inflated.field.usable, grid, prior).inside & seen
     pairs = match_keypoints(
-        warped,
-        prepared.deflated.volume,
-        Mask(lung & both, grid.ras_from_ijk),
-        match,
-        first_region=Mask(expected, grid.ras_from_ijk),
+        resample(inflated, grid, prior),
+        deflated,
+        Mask(resample_mask(observed.found.lung, grid).inside & both, grid.ras_from_ijk),
+        MatchSettings(voxel_mm=voxel, reach_mm=settings.reach_mm),
+        first_region=Mask(covered(moved, grid).inside & both, grid.ras_from_ijk),
     )
     return Pairs(rigid(inf_from_def(pairs.first)), pairs.second, pairs.ncc)
 
@@ -196,12 +212,16 @@ def _regional(gravity: Array, settings: Settings) -> Step:
     return step
 
 
-def _corrected(model: Model, target: Target, _start: Fit) -> Model:
-    """An elastic field on top, stiffer where it would turn elements inside out; none where that does not help."""
-    mesh, tissue = model.system.mesh, model.system.tissue
-    pull = pull_of(target, mesh, model.displacement)
-    for strain in CORRECTION_STRAINS:
-        found = correct(mesh, model.displacement, tissue, pull, strain)
-        if (found.det_f > LEAST_DET).all() or found.det_f.min() >= model.fit.state.det_f.min():
-            return replace(model, displacement=model.displacement + found.u)
-    return model
+def corrected(strain: float) -> Step:
+    """An elastic field on top, or none where that would turn more elements inside out."""
+
+    def step(model: Model, target: Target, _start: Fit) -> Model:
+        mesh = model.system.mesh
+        pull = pull_of(target, mesh, model.displacement)
+        found = correct(mesh, model.displacement, model.system.tissue, pull, strain)
+        inverted, before = ((det <= 0).mean() for det in (found.det_f, model.fit.state.det_f))
+        if inverted > max(before, MOST_INVERTED):
+            return model
+        return replace(model, displacement=model.displacement + found.u)
+
+    return step

@@ -1,0 +1,105 @@
+"""The ladder takes a rung only when places held back from it say so."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from poro.fit import Fit, fit
+from poro.mesh import TetMesh, stuff
+from poro.model import assemble
+from poro.observations import Target
+from poro.tissue import Tissue
+from registration.matching import Pairs
+from vatsloc.workflow.ladder import Model, Step, best_of, corrected, held_back, misfit
+
+GRADIENT = np.array([[-0.1, 0.02, 0.0], [0.03, -0.05, 0.04], [0.0, -0.02, 0.08]])
+
+
+@pytest.fixture(scope="module")
+def lung() -> TetMesh:
+    """An ellipsoid of 60, 70 and 80 mm half axes."""
+    axes = np.array([60.0, 70.0, 80.0])
+    shape = (30, 34, 38)
+    affine = np.diag([5.0, 5.0, 5.0, 1.0])
+    affine[:3, 3] = -2.5 * (np.array(shape) - 1)
+    x = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1) * 5.0 + affine[:3, 3]
+    return stuff(np.linalg.norm(x / axes, axis=-1) < 1, affine, 18.0)
+
+
+@pytest.fixture(scope="module")
+def surface(lung: TetMesh) -> Target:
+    """Where the lung's surface goes under GRADIENT."""
+    boundary = lung.boundary
+    moved = boundary.moved(boundary.points @ (np.eye(3) + GRADIENT).T)
+    return Target(moved.points, moved.node_normals, np.ones(len(moved.points)))
+
+
+@pytest.fixture(scope="module")
+def still(lung: TetMesh) -> Model:
+    """A model that has not learned anything: everything stays where it is."""
+    hilum = np.flatnonzero(np.linalg.norm(lung.points - [-50, 0, 0], axis=1) < 25)
+    system = assemble(lung, Tissue(), np.array([1.0, 0, 0]), hilum, np.zeros((len(hilum), 3)))
+    boundary = lung.boundary
+    found: Fit = fit(system, Target(boundary.points, boundary.node_normals, np.ones(len(boundary.points))))
+    nothing = np.zeros_like(lung.points)
+    return Model(system, replace(found, state=replace(found.state, u=nothing)), nothing, _pairs(), ())
+
+
+def _pairs(noise_mm: float = 0.0, smooth: bool = True) -> Pairs:
+    rng = np.random.default_rng(5)
+    x = rng.uniform(-45, 45, (300, 3))
+    motion = x @ GRADIENT.T if smooth else 0 * x
+    return Pairs(x, x + motion + noise_mm * rng.normal(size=x.shape), np.ones(300))
+
+
+def _steps() -> dict[str, Step]:
+    return {f"strain {strain:g}": corrected(strain) for strain in (0.05, 0.0125)}
+
+
+def test_misfit_is_the_median_distance(lung: TetMesh) -> None:
+    shift = np.array([2.0, -1.0, 2.0])
+    x = np.array([[0.0, 0, 0], [10, 5, 0], [-20, 3, 7]])
+    y = x + shift + np.array([[0.0, 0, 0], [0, 4, 0], [0, 0, 30]])
+    assert misfit(lung, np.broadcast_to(shift, lung.points.shape), Pairs(x, y, np.ones(3))) == pytest.approx(4.0)
+
+
+def test_a_quarter_is_held_back_in_whole_blocks() -> None:
+    points = np.random.default_rng(0).uniform(0, 400, (4000, 3))
+    hidden = held_back(points)
+    assert 0.15 < hidden.mean() < 0.35
+    block = np.floor(points / 40).astype(int)
+    _, number = np.unique(block, axis=0, return_inverse=True)
+    share = np.bincount(number, hidden) / np.bincount(number)
+    assert set(np.unique(share)) == {0.0, 1.0}
+
+
+def test_a_rung_that_predicts_what_it_has_not_seen_is_taken_and_follows_all_pairs(
+    still: Model, surface: Target
+) -> None:
+    model, blind = best_of(_steps(), still, still, surface)
+    assert sum(rung.kept for rung in model.rungs) == 1
+    best = min(model.rungs, key=lambda rung: rung.after_mm)
+    assert best.kept
+    assert best.before_mm == pytest.approx(
+        np.median(np.linalg.norm(_pairs().first @ GRADIENT.T, axis=1)[held_back(_pairs().second)])
+    )
+    assert model.held_back_mm == best.after_mm < 0.3 * best.before_mm
+    mesh = still.system.mesh
+    hidden = held_back(_pairs().second)
+    assert misfit(mesh, model.displacement, _pairs().only(hidden)) < misfit(
+        mesh, blind.displacement, _pairs().only(hidden)
+    )
+
+
+def test_noise_alone_is_not_worth_a_rung(still: Model) -> None:
+    boundary = still.system.mesh.boundary
+    stays = Target(boundary.points, boundary.node_normals, np.ones(len(boundary.points)))
+    noisy = replace(still, pairs=_pairs(noise_mm=2.0, smooth=False))
+    model, blind = best_of(_steps(), noisy, noisy, stays)
+    assert [rung.kept for rung in model.rungs] == [False, False]
+    assert_allclose(model.displacement, 0)
+    assert_allclose(blind.displacement, 0)
