@@ -151,37 +151,55 @@ def _between(scores: Array, shift: Array) -> tuple[Array, Array]:
     return result, known
 
 
+@njit(cache=True, fastmath=True)
+def _correlation(block, ff, moving, believed, a, b, c, radius, flat):
+    """NCC of a centred block with the one about voxel (a, b, c); -1 where that cannot be believed or shows nothing."""
+    ni, nj, nk = moving.shape
+    if a < radius or b < radius or c < radius or a >= ni - radius or b >= nj - radius or c >= nk - radius:
+        return -1.0
+    if not believed[a, b, c]:
+        return -1.0
+    s, ss, sf = 0.0, 0.0, 0.0
+    width = 2 * radius + 1
+    for p in range(width):
+        for q in range(width):
+            for r in range(width):
+                m = moving[a - radius + p, b - radius + q, c - radius + r]
+                s += m
+                ss += m * m
+                sf += m * block[p, q, r]
+    mm = ss - s * s / width**3
+    if mm < width**3 * flat * flat:
+        return -1.0
+    return sf / np.sqrt(mm * ff)
+
+
 @njit(cache=True, parallel=True, fastmath=True)
 def _blocks(fixed, moving, starts, believed, radius, reach, flat, scores):
+    """Fill scores (n, s, s, s) at every other shift, then at every one near the best of those: peaks are wider."""
     ni, nj, nk = fixed.shape
     width = 2 * radius + 1
-    count = width**3
     for n in prange(starts.shape[0]):
         i, j, k = starts[n, 0], starts[n, 1], starts[n, 2]
         if min(i, j, k) < radius or i >= ni - radius or j >= nj - radius or k >= nk - radius:
             continue
         block = fixed[i - radius : i + radius + 1, j - radius : j + radius + 1, k - radius : k + radius + 1].copy()
-        mean = block.sum() / count
-        block -= mean
+        block -= block.sum() / width**3
         ff = (block * block).sum()
-        if ff < count * flat * flat:
+        if ff < width**3 * flat * flat:
             continue
-        for di in range(-reach, reach + 1):
-            for dj in range(-reach, reach + 1):
-                for dk in range(-reach, reach + 1):
-                    a, b, c = i + di, j + dj, k + dk
-                    if a < radius or b < radius or c < radius:
-                        continue
-                    if a >= ni - radius or b >= nj - radius or c >= nk - radius or not believed[a, b, c]:
-                        continue
-                    s, ss, sf = 0.0, 0.0, 0.0
-                    for p in range(width):
-                        for q in range(width):
-                            for r in range(width):
-                                m = moving[a - radius + p, b - radius + q, c - radius + r]
-                                s += m
-                                ss += m * m
-                                sf += m * block[p, q, r]
-                    mm = ss - s * s / count
-                    if mm >= count * flat * flat:
-                        scores[n, di + reach, dj + reach, dk + reach] = sf / np.sqrt(mm * ff)
+        best, da, db, dc = -1.0, 0, 0, 0
+        for di in range(-reach, reach + 1, 2):
+            for dj in range(-reach, reach + 1, 2):
+                for dk in range(-reach, reach + 1, 2):
+                    ncc = _correlation(block, ff, moving, believed, i + di, j + dj, k + dk, radius, flat)
+                    scores[n, di + reach, dj + reach, dk + reach] = ncc
+                    if ncc > best:
+                        best, da, db, dc = ncc, di, dj, dk
+        if best <= -1.0:
+            continue
+        for di in range(max(da - 2, -reach), min(da + 2, reach) + 1):
+            for dj in range(max(db - 2, -reach), min(db + 2, reach) + 1):
+                for dk in range(max(dc - 2, -reach), min(dc + 2, reach) + 1):
+                    ncc = _correlation(block, ff, moving, believed, i + di, j + dj, k + dk, radius, flat)
+                    scores[n, di + reach, dj + reach, dk + reach] = ncc

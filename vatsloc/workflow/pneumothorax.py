@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from poro.fit import Fit
 from poro.mesh import TetMesh, TriSurface, interpolate, locate
@@ -79,15 +79,19 @@ def collapse(
     if not settings.residual.on:
         stages.skip("residual registration", "switched off in the settings")
         return Collapse(observed, model, None, after)
+    rigid, chosen = observed.def_from_inf_rigid, settings.residual
+    if any(rung.kept for rung in model.rungs):
+        chosen = chosen.model_copy(update={"levels": max(chosen.levels - 1, 1)})
     with stages.stage("residual registration"):
         residual = residual_registration(
             prepared.inflated,
             prepared.deflated,
             observed.found.lung,
-            MeshMap(pose.mesh_inf, after, observed.def_from_inf_rigid),
+            MeshMap(pose.mesh_inf, after, rigid),
             before,
             observed.surface,
-            settings.residual,
+            chosen,
+            replace(model.pairs, first=rigid.inverse()(model.pairs.first)),
         )
     return Collapse(observed, model, residual, after if residual is None else after + residual.displacement)
 

@@ -17,6 +17,8 @@ from poro.mesh import TetMesh
 from poro.tissue import Tissue
 from registration.ffd import FfdSettings, Weights, register_ffd
 from registration.inversion import invert_at
+from registration.matching import Pairs
+from registration.penalties import Keypoints
 from registration.resample import resample, resample_mask
 from registration.volume import Array, Mask
 from vatsloc.imaging.cbct import PreparedCbct
@@ -66,11 +68,14 @@ def residual_registration(
     mesh_before: TetMesh,
     surface: SurfacePoints,
     settings: ResidualSettings,
+    pairs: Pairs,
 ) -> Residual | None:
     """Displacements that take the modelled nodes to where the images show their tissue; None where too little is seen.
 
     lung_def: the collapsed lung as it was segmented; def_from_inf: the model's map; mesh_before: its undeformed mesh in
-    the deflated CBCT's frame; surface: observed points, which place the border where the images inside do not.
+    the deflated CBCT's frame; surface: observed points, which place the border where the images inside do not; pairs:
+    places found again inside the lung, in the frames of the inflated and the deflated CBCT, which hold both
+    registrations where they show.
     """
     grid = deflated.volume.grid
     nodes = def_from_inf.moved
@@ -86,11 +91,16 @@ def residual_registration(
         spacing_mm=settings.grid_mm,
         levels=settings.levels,
         voxel_mm=settings.voxel_mm,
-        weights=Weights(bending=settings.bending),
+        weights=Weights(bending=settings.bending, keypoints=settings.keypoints),
+    )
+    expected_at, weights = def_from_inf(pairs.first), np.ones(len(pairs))
+    forth, homeward = (
+        Keypoints(one, other, weights) if len(pairs) else None
+        for one, other in ((pairs.second, expected_at), (expected_at, pairs.second))
     )
     seen_by_both = Mask(both_see, grid.ras_from_ijk)
-    there = register_ffd(deflated.volume, warped, ffd, fixed_mask=observed, moving_mask=seen_by_both)
-    back = register_ffd(warped, deflated.volume, ffd, fixed_mask=expected, moving_mask=seen_by_both)
+    there = register_ffd(deflated.volume, warped, ffd, fixed_mask=observed, moving_mask=seen_by_both, keypoints=forth)
+    back = register_ffd(warped, deflated.volume, ffd, fixed_mask=expected, moving_mask=seen_by_both, keypoints=homeward)
     inverse = invert_at(there.moving_from_fixed, nodes, nodes)
     placed, other = inverse.points_fixed, back.moving_from_fixed(nodes)
     disagreement = np.linalg.norm(placed - other, axis=1)

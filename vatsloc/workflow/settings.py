@@ -64,13 +64,16 @@ class KeypointSettings(_Table):
 
 
 class ResidualSettings(_Table):
-    """Registration of the modelled lung to the observed one. Lengths in mm; bending: mm2."""
+    """Registration of the modelled lung to the observed one. Lengths in mm; bending: mm2; keypoints: weight, 1/mm2;
+    levels: one fewer where the model already follows keypoints.
+    """
 
     on: bool = True
     grid_mm: float = Field(default=16.0, ge=6, le=64)
     levels: int = Field(default=3, ge=1, le=5)
     voxel_mm: float = Field(default=2.0, ge=0.5, le=8)
     bending: float = Field(default=300.0, gt=0)
+    keypoints: float = Field(default=0.01, ge=0)
     max_disagreement_mm: float = Field(default=3.0, gt=0)
 
 
