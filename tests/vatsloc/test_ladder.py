@@ -15,6 +15,7 @@ from poro.observations import Target
 from poro.tissue import Tissue
 from registration.matching import Pairs
 from vatsloc.workflow.ladder import Model, Step, best_of, corrected, held_back, misfit
+from vatsloc.workflow.localize import place_sigma_mm
 
 GRADIENT = np.array([[-0.1, 0.02, 0.0], [0.03, -0.05, 0.04], [0.0, -0.02, 0.08]])
 
@@ -103,3 +104,8 @@ def test_noise_alone_is_not_worth_a_rung(still: Model) -> None:
     assert [rung.kept for rung in model.rungs] == [False, False]
     assert_allclose(model.displacement, 0)
     assert_allclose(blind.displacement, 0)
+
+
+def test_the_farther_from_a_place_found_again_the_less_sure() -> None:
+    assert place_sigma_mm(0.0) == place_sigma_mm(8.0) == pytest.approx(0.7)
+    assert place_sigma_mm(28.0) == pytest.approx(0.7 + 0.17 * 20)

@@ -28,6 +28,9 @@ REGISTRATION_MM = 0.5
 """Standard deviation per axis of one registration where it holds: a quarter of its finest voxel."""
 MODEL_ALONE_MM = 4.0
 """The same of the model without images inside the lung: 1.7 to 6.9 mm on twins and phantoms."""
+FOUND_MM, FOUND_REACH_MM, FOUND_SLOPE = 0.7, 8.0, 0.17
+"""The same of tissue near a place that was found again, how far that holds, and by how much it grows per millimetre
+beyond: an upper bound over the dense truth of the three twins and two phantoms (small-right 4, small-left 3)."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +82,7 @@ def localize(case: Case, settings: Settings, stages: Stages) -> Localization:
     rigid = collapse.def_from_inf_rigid
     moved = MeshMap(pose.mesh_inf, collapse.mesh_after.points, rigid)
     nodule_def = moved(nodule_inf[None])[0]
-    lengths, axes = nodule_ellipsoid(pose, collapse, nodule_inf)
+    lengths, axes = nodule_ellipsoid(pose, collapse, nodule_inf, nodule_def)
     gates = quality_gates(pose, collapse, settings.gates)
     gates["ellipsoid"] = at_most(
         lengths[0], settings.gates.max_ellipsoid_mm, "The nodule's position is too uncertain for a wedge resection."
@@ -88,15 +91,19 @@ def localize(case: Case, settings: Settings, stages: Stages) -> Localization:
     return Localization(prepared, pose, collapse, nodule_inf, nodule_def, lengths, axes, gates)
 
 
-def nodule_ellipsoid(pose: ChangeOfPose, collapse: Collapse, nodule_inf: Array) -> tuple[Array, Array]:
+def nodule_ellipsoid(
+    pose: ChangeOfPose, collapse: Collapse, nodule_inf: Array, nodule_def: Array
+) -> tuple[Array, Array]:
     """Semi-axes (3,) mm, longest first, and their directions (3, 3) in rows, that hold the nodule with 95 %.
 
     Where the images placed the tissue around the nodule, their registrations' errors and disagreement count; where they
-    did not, the fit's covariance and what the images corrected elsewhere.
+    did not, the fit's covariance. Either way it is no surer than the distance to the nearest place found again allows.
     """
     point = collapse.def_from_inf_rigid(nodule_inf[None])[0]
-    residual = collapse.residual
-    model_mm = MODEL_ALONE_MM if residual is None else max(residual.model_error_mm, collapse.fit.surface_rms_mm)
+    residual, pairs = collapse.residual, collapse.model.pairs
+    least_mm, model_mm = 0.0, MODEL_ALONE_MM
+    if collapse.model.rungs:
+        least_mm = model_mm = place_sigma_mm(float(np.linalg.norm(pairs.second - nodule_def, axis=1).min()))
     lengths, directions = ellipsoid95(collapse.fit, collapse.system, point, model_mm)
     if residual is None:
         return lengths, directions.T
@@ -104,9 +111,14 @@ def nodule_ellipsoid(pose: ChangeOfPose, collapse: Collapse, nodule_inf: Array) 
     at = locate(pose.mesh_inf, nodule_inf[None])
     trust = float(interpolate(at, residual.seen.astype(float))[0])
     disagreement = float(interpolate(at, np.where(residual.seen, residual.disagreement_mm, 0.0))[0])
-    known = 2 * REGISTRATION_MM**2 + (disagreement / 2) ** 2
+    known = max(2 * REGISTRATION_MM**2 + (disagreement / 2) ** 2, least_mm**2)
     values, vectors = np.linalg.eigh(trust * known * np.eye(3) + (1 - trust) * covariance)
     return np.sqrt(CHI2_95_3D * values[::-1]), vectors[:, ::-1].T
+
+
+def place_sigma_mm(distance_mm: float) -> float:
+    """Standard deviation per axis of tissue at a distance from the nearest place found again."""
+    return FOUND_MM + FOUND_SLOPE * max(distance_mm - FOUND_REACH_MM, 0.0)
 
 
 def quality_gates(pose: ChangeOfPose, collapse: Collapse, limits: GateSettings) -> dict[str, Gate]:
@@ -136,6 +148,10 @@ def quality_gates(pose: ChangeOfPose, collapse: Collapse, limits: GateSettings) 
         folded = pose.ffd.folded_share
         gates["registration_folds"] = at_most(
             folded, limits.max_folded_share, "The registration of phase 1 folds space."
+        )
+    if collapse.model.held_back_mm is not None:
+        gates["held_back"] = at_most(
+            collapse.model.held_back_mm, limits.max_held_back_mm, "The model does not predict places it has not seen."
         )
     if collapse.residual is not None:
         gates["agreement"] = at_least(

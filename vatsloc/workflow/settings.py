@@ -91,6 +91,7 @@ class GateSettings(_Table):
     max_fissure_share: float = 0.1
     min_agreement: float = 0.5
     max_model_error_mm: float = 10.0
+    max_held_back_mm: float = 5.0
     max_ellipsoid_mm: float = 15.0
 
 
