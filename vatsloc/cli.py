@@ -239,6 +239,19 @@ def stability_registration_command(
     print(out / "tables.md")
 
 
+@stability.command("fit")
+def stability_fit_command(
+    cases: Annotated[list[Path], typer.Argument(metavar="CASES...", help="Case folders with landmarks.")],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for CSV files and tables.md.")],
+) -> None:
+    """Collapse: disturbed surface, gravity, hilum and spine; random starts; what the surface tells of theta."""
+    from vatsloc.study.stability_fit import stability_fit
+    from vatsloc.workflow.settings import Settings
+
+    stability_fit(cases, out, Settings(), say)
+    print(out / "tables.md")
+
+
 @bench.command("registration")
 def bench_registration_command(
     cases: Annotated[

@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from poro.correct import correct, pull_of
-from poro.fit import Fit, FitSettings, fit
+from poro.fit import Fit, FitSettings, FitStatus, fit
 from poro.mesh import TetMesh, interpolate, locate
-from poro.model import PoroSystem, assemble
+from poro.model import PoroStatus, PoroSystem, assemble
 from poro.modes import hilum_modes, shape_modes
 from poro.observations import Target
 from poro.tissue import Tissue
@@ -97,7 +97,7 @@ def climb(gravity: Array, prepared: Prepared, observed: Observed, settings: Sett
     if settings.model.regional:
         with stages.stage("regional fit"):
             model, blind = best_of({"regional fit": _regional(gravity, settings)}, model, blind, surface)
-        if model.rungs[-1].kept:
+        if any(rung.kept for rung in model.rungs):
             with stages.stage("keypoints again"):
                 pairs = inner_pairs(prepared, observed, model.displacement, settings.keypoints)
                 model, blind = replace(model, pairs=pairs), replace(blind, pairs=pairs)
@@ -116,14 +116,19 @@ def best_of(steps: dict[str, Step], model: Model, blind: Model, surface: Target)
     unseen, shown = model.pairs.only(hidden), _with(surface, model.pairs.only(~hidden))
     trials = {name: step(blind, shown, blind.fit) for name, step in steps.items()}
     before = misfit(mesh, blind.displacement, unseen)
-    after = {name: misfit(mesh, trial.displacement, unseen) for name, trial in trials.items()}
-    best = min(after, key=lambda name: after[name])
-    taken = after[best] < GAIN * before
+    after = {name: misfit(mesh, trial.displacement, unseen) for name, trial in trials.items() if _settled(trial)}
+    best = min(after, key=lambda name: after[name], default="")
+    if best and after[best] < GAIN * before:
+        found = steps[best](model, _with(surface, model.pairs), trials[best].fit)
+        taken = _settled(found)
+    else:
+        found, taken = model, False
     rungs = (*model.rungs, *(Rung(name, before, mm, taken and name == best) for name, mm in after.items()))
-    if taken:
-        blind = trials[best]
-        model = steps[best](model, _with(surface, model.pairs), blind.fit)
-    return replace(model, rungs=rungs), blind
+    return (replace(found, rungs=rungs), trials[best]) if taken else (replace(model, rungs=rungs), blind)
+
+
+def _settled(model: Model) -> bool:
+    return model.fit.status is not FitStatus.CONTACT and model.fit.state.status is not PoroStatus.NOT_SETTLED
 
 
 def _too_few(pairs: Pairs) -> str | None:

@@ -76,6 +76,13 @@ def localize(case: Case, settings: Settings, stages: Stages) -> Localization:
     prepared = prepare(case, stages)
     pose = change_of_pose(case, prepared, settings, stages)
     collapse = pneumothorax(case, prepared, pose, settings, stages)
+    return conclude(case, prepared, pose, collapse, settings, stages)
+
+
+def conclude(
+    case: Case, prepared: Prepared, pose: ChangeOfPose, collapse: Collapse, settings: Settings, stages: Stages
+) -> Localization:
+    """Where the nodule went, how sure that is, and which quality gates hold."""
     if collapse.fit.state.status is PoroStatus.NOT_SETTLED or collapse.fit.status is FitStatus.CONTACT:
         raise NotConverged("The contact of the collapsing lung did not settle; try another mesh edge_mm.")
     nodule_inf = pose.inf_from_ct(case.nodule.centre_ras[None])[0]

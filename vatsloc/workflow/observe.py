@@ -48,10 +48,17 @@ class Observed:
         return self.rigid.moving_from_fixed.inverse()
 
 
-def observe(case: Case, prepared: Prepared, pose: ChangeOfPose, settings: Settings, stages: Stages) -> Observed:
-    """Register the spines, find the collapsed lung's surface and how its hilum moved."""
+def observe(
+    case: Case,
+    prepared: Prepared,
+    pose: ChangeOfPose,
+    settings: Settings,
+    stages: Stages,
+    rigid: RigidFit | None = None,
+) -> Observed:
+    """Register the spines (unless `rigid` is given), find the collapsed lung's surface and how its hilum moved."""
     with stages.stage("spine inflated to deflated"):
-        rigid = register_spine(
+        rigid = rigid or register_spine(
             prepared.deflated.volume,
             prepared.inflated.volume,
             prepared.spine_deflated.mask,
