@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from poro.choice import keep_in_range
 from poro.fit import Fit, fit
+from poro.laws import neo_hookean
 from poro.mesh import TetMesh, stuff
 from poro.model import assemble
 from poro.observations import Target
@@ -47,7 +49,8 @@ def still(lung: TetMesh) -> Model:
     boundary = lung.boundary
     found: Fit = fit(system, Target(boundary.points, boundary.node_normals, np.ones(len(boundary.points))))
     nothing = np.zeros_like(lung.points)
-    return Model(system, replace(found, state=replace(found.state, u=nothing)), nothing, _pairs(), ())
+    solid = keep_in_range(system, found.state, neo_hookean(Tissue()))
+    return Model(system, replace(found, state=replace(found.state, u=nothing)), nothing, _pairs(), (), solid)
 
 
 def _pairs(noise_mm: float = 0.0, smooth: bool = True) -> Pairs:

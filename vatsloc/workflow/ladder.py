@@ -11,8 +11,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from poro.choice import Chosen, keep_in_range
 from poro.correct import correct, pull_of
 from poro.fit import Fit, FitSettings, FitStatus, fit
+from poro.laws import neo_hookean
 from poro.mesh import TetMesh, interpolate, locate
 from poro.model import PoroStatus, PoroSystem, assemble
 from poro.modes import hilum_modes, shape_modes
@@ -55,7 +57,7 @@ class Model:
     """The collapse by mechanics. displacement: (n, 3) mm at the nodes of system.mesh, correction included.
 
     pairs: places found again, in the deflated CBCT's frame: `first` before the collapse (placed by the spine), `second`
-    after it; rungs: what was tried beyond the plain fit.
+    after it; rungs: what was tried beyond the plain fit; solid: which strain measure the plain fit ended with, and why.
     """
 
     system: PoroSystem
@@ -63,6 +65,7 @@ class Model:
     displacement: Array
     pairs: Pairs
     rungs: tuple[Rung, ...]
+    solid: Chosen
 
     @property
     def held_back_mm(self) -> float | None:
@@ -83,7 +86,9 @@ def climb(gravity: Array, prepared: Prepared, observed: Observed, settings: Sett
     surface = surface_target(observed.surface)
     with stages.stage("fit"):
         plain = fit(system, surface, fit_settings(settings))
-    model = Model(system, plain, plain.state.u, NO_PAIRS, ())
+        solid = keep_in_range(system, plain.state, neo_hookean(tissue))
+    plain = replace(plain, state=solid.state)
+    model = Model(system, plain, solid.state.u, NO_PAIRS, (), solid)
     if not settings.keypoints.on:
         stages.skip("keypoints", "switched off in the settings")
         return model

@@ -177,6 +177,7 @@ def _record(case: Case, found: Localization, settings: Settings, stages: Stages)
             "input_sha256": dict(case.input_sha256),
             "side": case.side,
             "gravity_ras": case.gravity_ras,
+            "solid": found.collapse.model.solid.entry(),
             "residuals": _residuals(found),
         },
     )
