@@ -190,6 +190,8 @@ def test_a_case_s_rows_hold_the_errors_and_the_seconds_of_what_each_variant_need
 def test_every_variant_s_settings_are_valid_and_unknown_names_are_refused() -> None:
     assert VARIANTS["tetrahedra-5"].settings.mesh.model_edge_mm == 5
     assert not VARIANTS["paper-cost-alone"].settings.residual.on
+    assert not VARIANTS["paper-cost-alone"].settings.keypoints.on
+    assert VARIANTS["alone"].settings.keypoints.on
     assert VARIANTS["fast"].settings.registration.grid_mm == 20
     for variant in VARIANTS.values():
         assert variant.settings.gates.min_overlap == 0.4

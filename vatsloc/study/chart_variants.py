@@ -88,15 +88,18 @@ def _ffd(says: str, register: Register = register_sliding, **over: float) -> Var
     return Variant(says, Scored.POSE, {"registration": over}, register=register)
 
 
-def _model(says: str, residual: bool = True, edge_mm: float | None = None, **over: Any) -> Variant:
-    changed: dict[str, Any] = {"model": over, "residual": {"on": residual}}
+def _model(
+    says: str, residual: bool = True, edge_mm: float | None = None, keypoints: bool = True, **over: Any
+) -> Variant:
+    changed: dict[str, Any] = {"model": over, "residual": {"on": residual}, "keypoints": {"on": keypoints}}
     if edge_mm is not None:
         changed["mesh"] = {"model_edge_mm": edge_mm}
     return Variant(says, Scored.COLLAPSE, changed)
 
 
 # What is left on is not scored; the pose needs none of it.
-_SPINE_ALONE = {"registration": {"on": False}, "residual": {"on": False}, "model": {"max_steps": 1}}
+_OFF = {"on": False}
+_SPINE_ALONE = {"registration": _OFF, "residual": _OFF, "keypoints": _OFF, "model": {"max_steps": 1}}
 
 VARIANTS: dict[str, Variant] = {
     "rigid": Variant("spine alone, in both phases", Scored.SPINES, _SPINE_ALONE),
@@ -117,8 +120,16 @@ VARIANTS: dict[str, Variant] = {
     "tetrahedra-5": _model("model of 5 mm tetrahedra", edge_mm=5.0),
     "alone": _model("model without residual registration", residual=False),
     "alone-8": _model("model of 8 mm tetrahedra without residual registration", residual=False, edge_mm=8.0),
+    "no-keypoints": _model("model fitted to the surface alone", keypoints=False),
+    "no-keypoints-alone": _model(
+        "model fitted to the surface alone, without residual registration", residual=False, keypoints=False
+    ),
+    "no-regional": _model("no regional parameters", regional=False),
+    "no-correction": _model("no elastic correction", correct=False),
     "paper-cost": _model("the paper's cost", cost="plain"),
-    "paper-cost-alone": _model("the paper's cost without residual registration", residual=False, cost="plain"),
+    "paper-cost-alone": _model(
+        "the paper's cost and parameters, without residual registration", residual=False, keypoints=False, cost="plain"
+    ),
     "no-hilum": _model("hilum not tracked", hilum=False),
     "no-hilum-alone": _model("hilum not tracked, without residual registration", residual=False, hilum=False),
     "no-diaphragm": _model("diaphragm held still", diaphragm=False),
