@@ -144,6 +144,21 @@ def test_record_of_the_run_is_there(page):
         assert words in page
 
 
+def test_what_was_chosen_is_told_with_its_reason():
+    rungs = [
+        {"name": "regional", "before_mm": 3.214, "after_mm": 2.5, "kept": True},
+        {"name": "elastic", "before_mm": 2.5, "after_mm": None, "kept": False},
+    ]
+    solid = {"model": "linear strain", "why": "linear strain: 0.02 % of the elements are out of range"}
+    page = words_alone(solid=solid, residuals={"ladder": rungs})
+    assert '<dd id="solid">linear strain: 0.02 % of the elements are out of range</dd>' in page
+    assert (
+        "<dt>taken: regional</dt><dd>median misfit at places held back 3.21 mm without it, 2.5 mm with it</dd>" in page
+    )
+    assert "<dt>not taken: elastic</dt>" in page
+    assert "taken:" not in words_alone()
+
+
 @pytest.mark.parametrize(
     ("changes", "level", "words"),
     [
