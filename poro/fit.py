@@ -54,7 +54,7 @@ class FitSettings:
 class FitStatus(Enum):
     """How a fit ended."""
 
-    CONVERGED = "the last step no longer lowered the cost by a thousandth"
+    CONVERGED = "no step lowered the cost by a thousandth any more, or promised a tenth of that"
     STOPPED = "the steps ran out before the cost settled"
     CONTACT = "the forward solution at the best parameters did not settle"
 
@@ -215,7 +215,8 @@ def _descend(problem: _Problem, theta: Array) -> tuple[Array, PoroState, tuple[F
     for _ in range(problem.settings.max_steps):
         near = np.maximum(low, theta - radius * reach), np.minimum(high, theta + radius * reach)
         step = _bounded_step(normal, slope, theta, *near, free)
-        if not step.any():
+        promised = -(slope + 0.5 * normal @ step) @ step
+        if promised <= 0.1 * problem.settings.tolerance * cost:
             return theta, state, tuple(history), True
         trial_state = solve(problem.system, Theta.of(theta + step), state)
         trial_rows = problem.observer.residuals(trial_state.u)
