@@ -6,6 +6,9 @@ used from a million products on; below that, waking them takes longer than the w
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from math import prod
+
 import numpy as np
 from numba import njit, prange
 
@@ -26,30 +29,39 @@ class Banded:
         first = np.minimum(first, matrix.shape[1] - width)
         taps = first[:, None] + np.arange(width)
         self.shape = (matrix.shape[0], matrix.shape[1])
-        self.first, self.weights = first, np.ascontiguousarray(np.take_along_axis(matrix, taps, axis=1))
+        self.first = first
+        self.weights = np.ascontiguousarray(np.take_along_axis(matrix, taps, axis=1), dtype=float)
+        self._single = self.weights.astype(np.float32)
+
+    def weights_like(self, values: Array) -> Array:
+        """The entries in the precision of `values`."""
+        return self._single if values.dtype == np.float32 else self.weights
 
     def diagonal(self) -> Array:
         """Entries (i, i), (rows,), of a square matrix."""
         return self.weights[np.arange(self.shape[0]), np.arange(self.shape[0]) - self.first]
 
 
-def along_axes(values: Array, matrices: list[Banded]) -> Array:
+def along_axes(values: Array, matrices: Sequence[Banded]) -> Array:
     """Multiply axes 1, 2, 3 of (q, ni, nj, nk) by their matrices, cheapest order: axes that shrink most first."""
     for axis in sorted(range(3), key=lambda m: matrices[m].shape[0] / matrices[m].shape[1]):
-        s, matrix = values.shape, matrices[axis]
-        before, after = int(np.prod(s[: axis + 1])), int(np.prod(s[axis + 2 :]))
-        out = np.empty((before, matrix.shape[0], after), dtype=values.dtype)
-        flat = np.ascontiguousarray(values).reshape(before, s[axis + 1], after)
-        weights = matrix.weights.astype(values.dtype, copy=False)
-        many = out.size * weights.shape[1] > THREADS_FROM
-        if after == 1:
-            (_last_axis_threads if many else _last_axis)(flat, matrix.first, weights, out, 0, before)
-        else:
-            (_inner_axis_threads if many else _inner_axis)(
-                flat, matrix.first, weights, out, 0, out.shape[0] * out.shape[1]
-            )
-        values = out.reshape(*s[: axis + 1], matrix.shape[0], *s[axis + 2 :])
+        values = along_axis(values, axis + 1, matrices[axis])
     return values
+
+
+def along_axis(values: Array, axis: int, matrix: Banded) -> Array:
+    """Multiply one axis of an array by a matrix."""
+    s, rows = values.shape, matrix.shape[0]
+    before, after = prod(s[:axis]), prod(s[axis + 1 :])
+    out = np.empty((before, rows, after), dtype=values.dtype)
+    flat = np.ascontiguousarray(values).reshape(before, s[axis], after)
+    weights = matrix.weights_like(values)
+    many = out.size * weights.shape[1] > THREADS_FROM
+    if after == 1:
+        (_last_axis_threads if many else _last_axis)(flat, matrix.first, weights, out, 0, before)
+    else:
+        (_inner_axis_threads if many else _inner_axis)(flat, matrix.first, weights, out, 0, before * rows)
+    return out.reshape(*s[:axis], rows, *s[axis + 1 :])
 
 
 @njit(cache=True, fastmath=True)

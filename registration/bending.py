@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.polynomial.legendre import leggauss
 
-from registration.banded import Banded, along_axes
+from registration.banded import Banded, along_axis
 from registration.volume import Array, Grid
 
 
@@ -16,26 +16,31 @@ class BendingEnergy:
     """Mean over the control box of sum_ab |d2u / dx_a dx_b|^2, in 1/mm^2: c^T R c, R a sum of Kronecker products."""
 
     def __init__(self, control: Grid) -> None:
-        g0, g1, g2 = ([Banded(_gram(n, order)) for n in control.shape] for order in range(3))
-        h = control.spacing
-        cells = float(np.prod(np.array(control.shape) - 3))
-        self._terms: list[tuple[float, list[Banded]]] = []
-        for a in range(3):
-            self._terms.append((1 / (h[a] ** 4 * cells), [g2[m] if m == a else g0[m] for m in range(3)]))
-            b = (a + 1) % 3
-            cross = [g1[m] if m in (a, b) else g0[m] for m in range(3)]
-            self._terms.append((2 / (h[a] ** 2 * h[b] ** 2 * cells), cross))
+        h, cells = control.spacing, float(np.prod(np.array(control.shape) - 3))
+        self._gram = [
+            [Banded(_gram(n, order) / (h[m] ** (2 * order) * cells ** (1 / 3))) for order in range(3)]
+            for m, n in enumerate(control.shape)
+        ]
 
     def apply(self, c: Array) -> Array:
-        """R c for coefficients (q, ni, nj, nk) in mm; the energy is vdot(c, R c), its gradient 2 R c."""
-        out = np.zeros_like(c)
-        for weight, matrices in self._terms:
-            out += weight * along_axes(c, matrices)
-        return out
+        """R c for coefficients (q, ni, nj, nk) in mm; the energy is vdot(c, R c), its gradient 2 R c.
+
+        The six products of Gram matrices share what they have in common: 12 passes instead of 18.
+        """
+        gi, gj, gk = self._gram
+        i0, i1, i2 = (along_axis(c, 1, g) for g in gi)
+        both = along_axis(i0, 2, gj[0])
+        once = along_axis(i1, 2, gj[0]) + along_axis(i0, 2, gj[1])
+        plane = along_axis(i2, 2, gj[0]) + along_axis(i0, 2, gj[2]) + 2 * along_axis(i1, 2, gj[1])
+        return along_axis(plane, 3, gk[0]) + 2 * along_axis(once, 3, gk[1]) + along_axis(both, 3, gk[2])
 
     def diagonal(self) -> Array:
         """Diagonal of R, (ni, nj, nk)."""
-        return sum(w * np.einsum("i,j,k->ijk", *(m.diagonal() for m in matrices)) for w, matrices in self._terms)
+        total = np.zeros(())
+        for orders in ((2, 0, 0), (0, 2, 0), (0, 0, 2), (1, 1, 0), (1, 0, 1), (0, 1, 1)):
+            factors = [self._gram[m][order].diagonal() for m, order in enumerate(orders)]
+            total = total + (2 if 1 in orders else 1) * np.einsum("i,j,k->ijk", *factors)
+        return total
 
 
 def _gram(n: int, order: int) -> Array:

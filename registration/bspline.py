@@ -84,12 +84,18 @@ def control_grid(grid: Grid, spacing_mm: float) -> Grid:
     return Grid((int(n[0]), int(n[1]), int(n[2])), affine)
 
 
+def parallel(control: Grid, grid: Grid) -> bool:
+    """Whether each axis of one grid runs along the same axis of the other."""
+    a = control.ijk_from_ras[:3, :3] @ grid.ras_from_ijk[:3, :3]
+    return bool(np.abs(a - np.diag(np.diag(a))).max() <= 1e-6)
+
+
 class Lattice:
     """Dense evaluation on a voxel grid, and its adjoint, as one small matrix per axis."""
 
     def __init__(self, control: Grid, grid: Grid) -> None:
         a = control.ijk_from_ras @ grid.ras_from_ijk
-        if np.abs(a[:3, :3] - np.diag(np.diag(a[:3, :3]))).max() > 1e-6:
+        if not parallel(control, grid):
             raise ValueError(
                 "the control grid's axes must be parallel to the voxel grid's; use displacement(points) instead"
             )
@@ -115,14 +121,17 @@ class Lattice:
 def basis_derivative(x: Array, n: int, order: int) -> Array:
     """Weights (points, n) of cubic B-splines (order 0) or their first derivatives (order 1) at coordinates x.
 
-    x: (points,) in control-grid units, clamped to [1, n - 2]; the derivatives are per control-grid unit.
+    x: (points,) in control-grid units, clamped to [1, n - 2], so that derivatives beyond are zero; these are per
+    control-grid unit.
     """
+    beyond = (np.abs(x - (n - 1) / 2) > (n - 3) / 2 + 1e-9)[:, None]
     signed = np.clip(x, 1.0, n - 2.0)[:, None] - np.arange(n)[None, :]
     distance = np.abs(signed)
     if order == 0:
         near, far = (4 - 6 * distance**2 + 3 * distance**3) / 6, (2 - distance) ** 3 / 6
     else:
-        near, far = np.sign(signed) * (1.5 * distance**2 - 2 * distance), -np.sign(signed) * (2 - distance) ** 2 / 2
+        inward = np.where(beyond, 0.0, np.sign(signed))
+        near, far = inward * (1.5 * distance**2 - 2 * distance), -inward * (2 - distance) ** 2 / 2
     return np.where(distance < 1, near, np.where(distance < 2, far, 0.0))
 
 

@@ -11,7 +11,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from registration.bspline import BSplineField, control_grid
-from registration.field import DisplacementField, PointMap, sample_map
+from registration.corrected import CorrectedMap, on_grid
+from registration.field import DisplacementField, PointMap
 from registration.metric import GlobalNcc, LocalNcc
 from registration.newton import Descent, Stop, gauss_newton
 from registration.objective import Objective, Term
@@ -60,23 +61,6 @@ class FfdSettings:
 
 
 @dataclass(frozen=True)
-class CorrectedMap:
-    """x -> prior(x) + u(x): a B-spline displacement added to a prior map."""
-
-    prior: PointMap
-    field: BSplineField
-
-    def __call__(self, points_ras: Array) -> Array:
-        """Images (n, 3) of points (n, 3) in RAS mm."""
-        return self.prior(points_ras) + self.field.displacement(points_ras)
-
-    def dense(self, grid: Grid) -> DisplacementField:
-        """The whole map on the voxels of a grid parallel to the control grid."""
-        u = self.field.dense(grid).vectors
-        return DisplacementField(sample_map(self.prior, grid).vectors + u, grid.ras_from_ijk)
-
-
-@dataclass(frozen=True)
 class FfdFit:
     """moving_from_fixed: the map found; status: why the finest level stopped; history: objective per step and level;
     min_det, folded_share: least det of the map's gradient on the finest voxels, and share of them with det <= 0;
@@ -108,21 +92,23 @@ def register_ffd(
     moving_mask: Mask | None = None,
     prior: PointMap | None = None,
     keypoints: Keypoints | None = None,
+    start: BSplineField | None = None,
     progress: Progress | None = None,
 ) -> FfdFit:
     """Find the smooth correction u of a prior map so that moving(prior(x) + u(x)) looks like fixed(x).
 
     fixed_mask: where images are compared (default everywhere); moving_mask: what the moving image sees (samples that
     map outside lose their weight); prior: any map of points, fixed to moving (default identity); the bending energy is
-    that of u alone, so it also holds the result to the prior; keypoints: the coarsest level starts from their spline.
+    that of u alone, so it also holds the result to the prior; keypoints: the coarsest level starts from their spline;
+    start: or from this one, whose control points are as far apart as that level's.
     A barrier keeps det(dT/dx) > 0 at every level; if voxels fold all the same, the last level is repeated with a
     stronger one, and at last u is scaled down until none does.
     """
     setting = _Setting(settings, prior or RigidTransform.identity(), keypoints)
     fixed_mask = fixed_mask or Mask(np.ones(fixed.hu.shape, dtype=bool), fixed.ras_from_ijk)
     fixed, fixed_mask = cropped(fixed, fixed_mask)
-    pyramid = Pyramid(fixed, fixed_mask, moving, moving_mask)
-    spline, histories = _first(setting, fixed.grid), []
+    pyramid = Pyramid(fixed, fixed_mask, moving, moving_mask, settings.voxel_mm)
+    spline, histories = start or _first(setting, fixed.grid), []
     for level in range(settings.levels):
         if level > 0:
             spline = spline.refined()
@@ -132,15 +118,16 @@ def register_ffd(
         images = pyramid.at(min(max(settings.voxel_mm, spacing / 8), 8.0))
         spline, descent = _level(setting, images, spline)
         histories.append(descent.history)
+    whole = _Whole(setting.prior, images.samples.grid)
     for _ in range(2):
-        if _least_det(setting.prior, spline, images.samples.grid)[0] > 0:
+        if whole.det(spline).min() > 0:
             break
         setting = replace(setting, settings=_stiffer(setting.settings))
         spline, descent = _level(setting, images, spline)
         histories.append(descent.history)
-    spline, shrunk = _unfolded(setting.prior, spline, images.samples.grid)
-    least, share = _least_det(setting.prior, spline, images.samples.grid)
-    return FfdFit(CorrectedMap(setting.prior, spline), descent.stop, tuple(histories), least, share, shrunk)
+    spline, shrunk, det = whole.unfolded(spline)
+    found = CorrectedMap(setting.prior, spline)
+    return FfdFit(found, descent.stop, tuple(histories), float(det.min()), float(np.mean(det <= 0)), shrunk)
 
 
 def _first(setting: _Setting, grid: Grid) -> BSplineField:
@@ -192,16 +179,21 @@ def _stiffer(settings: FfdSettings) -> FfdSettings:
     return replace(settings, weights=replace(settings.weights, folding=100 * settings.weights.folding))
 
 
-def _least_det(prior: PointMap, spline: BSplineField, grid: Grid) -> tuple[float, float]:
-    """Least det of the map's gradient on the voxels, and the share of voxels where it is not positive."""
-    det = CorrectedMap(prior, spline).dense(grid).jacobian_determinant()
-    return float(det.min()), float(np.mean(det <= 0))
+class _Whole:
+    """The whole map P + u on the finest voxels."""
 
+    def __init__(self, prior: PointMap, grid: Grid) -> None:
+        self._grid, self._prior = grid, on_grid(prior, grid).vectors
 
-def _unfolded(prior: PointMap, spline: BSplineField, grid: Grid) -> tuple[BSplineField, float]:
-    """The spline scaled by the largest of 1, 0.9, 0.81, ... that folds no voxel."""
-    scale, c = 1.0, spline
-    while _least_det(prior, c, grid)[0] <= 0 and scale > 0.01:
-        scale *= 0.9
-        c = BSplineField(scale * spline.coefficients, spline.ras_from_ijk)
-    return c, scale
+    def det(self, spline: BSplineField) -> Array:
+        """det of its gradient, (ni, nj, nk)."""
+        vectors = self._prior + spline.dense(self._grid).vectors
+        return DisplacementField(vectors, self._grid.ras_from_ijk).jacobian_determinant()
+
+    def unfolded(self, spline: BSplineField) -> tuple[BSplineField, float, Array]:
+        """The spline scaled by the largest of 1, 0.9, 0.81, ... that folds no voxel, that factor, and det."""
+        scale, scaled = 1.0, spline
+        while (det := self.det(scaled)).min() <= 0 and scale > 0.01:
+            scale *= 0.9
+            scaled = BSplineField(scale * spline.coefficients, spline.ras_from_ijk)
+        return scaled, scale, det

@@ -6,8 +6,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-import numpy as np
-
 from registration.volume import Array
 
 
@@ -43,9 +41,17 @@ class Objective:
     def model(self, c: Array) -> Model:
         """Sum of the terms' models."""
         models = [term.model(c) for term in self.terms]
+        first, rest = models[0], models[1:]
+
+        def apply(d: Array) -> Array:
+            out = first.apply(d)
+            for m in rest:
+                out = out + m.apply(d)
+            return out
+
         return Model(
             sum(m.value for m in models),
-            np.sum([m.gradient for m in models], axis=0),
-            lambda d: np.sum([m.apply(d) for m in models], axis=0),
-            np.sum([m.diagonal for m in models], axis=0),
+            sum((m.gradient for m in rest), first.gradient),
+            apply,
+            sum((m.diagonal for m in rest), first.diagonal),
         )

@@ -37,6 +37,8 @@ def coarsen(volume: Volume, spacing_mm: float) -> Volume:
     """
     spacing = volume.grid.spacing
     wanted = np.maximum(spacing_mm, spacing)
+    if np.allclose(wanted, spacing):
+        return volume
     return _filtered(volume, volume.grid.with_spacing(wanted), np.sqrt((wanted**2 - spacing**2) / 6))
 
 

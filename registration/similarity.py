@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from math import prod
 from typing import Protocol
 
 import numpy as np
 
 from registration.bspline import Lattice
+from registration.corrected import is_separable
 from registration.field import PointMap
 from registration.interpolate import interpolate, warp_samples
 from registration.metric import Similarity
@@ -17,12 +19,13 @@ from registration.stretch import Stretch, cofactor, determinant
 from registration.volume import Array, Grid, Volume
 
 BLOCK = 2
+HESSIAN_BLOCK = 4
 
 
 class Metric(Protocol):
     """A dissimilarity of the samples; see `registration.metric`."""
 
-    def evaluate(self, m: Array, w: Array, with_slope: bool = True) -> Similarity: ...
+    def evaluate(self, m: Array, w: Array) -> Similarity: ...
 
 
 @dataclass(frozen=True)
@@ -36,15 +39,15 @@ class Samples:
         """Their centres, (n, 3), RAS mm."""
         return self.grid.to_ras(np.stack(np.unravel_index(self.index, self.grid.shape), axis=1).astype(float))
 
-    def blocks(self) -> tuple[Grid, Array]:
-        """Grid of blocks of 2^3 voxels, and the flat index (n,) of each sample's block."""
-        size = tuple(-(-n // BLOCK) for n in self.grid.shape)
+    def blocks(self, edge: int = BLOCK) -> tuple[Grid, Array]:
+        """Grid of blocks of edge^3 voxels, and the flat index (n,) of each sample's block."""
+        size = tuple(-(-n // edge) for n in self.grid.shape)
         affine = self.grid.ras_from_ijk.copy()
-        affine[:3, :3] *= BLOCK
-        affine[:3, 3] = self.grid.to_ras(np.full(3, (BLOCK - 1) / 2))
+        affine[:3, :3] *= edge
+        affine[:3, 3] = self.grid.to_ras(np.full(3, (edge - 1) / 2))
         i, j, k = np.unravel_index(self.index, self.grid.shape)
         grid = Grid((size[0], size[1], size[2]), affine)
-        return grid, np.ravel_multi_index((i // BLOCK, j // BLOCK, k // BLOCK), grid.shape)
+        return grid, np.ravel_multi_index((i // edge, j // edge, k // edge), grid.shape)
 
 
 class ImageTerm:
@@ -52,7 +55,7 @@ class ImageTerm:
 
     seen: where the moving image shows anything, in [0, 1]: samples that leave it lose their weight, which `refresh`
     resets and every evaluation keeps. mass_preserving: compare with (m + 1000) det(dT/dx) - 1000, the HU of the same
-    mass in the fixed image's volume.
+    mass in the fixed image's volume. What the line search saw last is kept, for the model is asked for there next.
     """
 
     def __init__(
@@ -67,70 +70,81 @@ class ImageTerm:
     ) -> None:
         self.samples, self._metric, self._moving, self._seen = samples, metric, moving, seen
         self._lattice = Lattice(control, samples.grid)
-        self._points = prior(samples.points())
+        self._points = _mapped(prior, samples)
         self._base = np.ascontiguousarray(moving.grid.to_ijk(self._points))
         self._a = np.ascontiguousarray(moving.grid.ijk_from_ras[:3, :3])
         self.share = np.ones(len(samples.index), dtype=np.float32)
-        blocks, self._block = samples.blocks()
+        blocks, self._coarse_block = samples.blocks(HESSIAN_BLOCK)
         self._coarse = Lattice(control, blocks)
+        blocks, self._block = samples.blocks()
         self._stretch = Stretch(control, blocks, prior) if mass_preserving else None
+        self._last: tuple[Array, _Warped] | None = None
 
     def refresh(self, c: Array) -> None:
         """Reset each sample's weight to how well the moving image sees it at c (soft rejection)."""
         if self._seen is not None:
-            moved = self._points + self._displacement(c)[:, self.samples.index].T
+            moved = self._points + self._lattice.forward(c).reshape(3, -1)[:, self.samples.index].T
             share = 4 * interpolate(self._seen.hu, self._seen.grid, moved, 0.0) - 3
-            self.share = np.clip(share, 0, 1).astype(np.float32)
+            self.share, self._last = np.clip(share, 0, 1).astype(np.float32), None
 
     def value(self, c: Array) -> float:
         """D at c."""
-        m, _ = self._warped(self._displacement(c))
-        if self._stretch is not None:
-            m = (m + 1000) * self._det(c)[0] - 1000
-        return self._metric.evaluate(m, self.share, with_slope=False).value
+        return self._at(c).similarity.value
 
     def model(self, c: Array) -> Model:
         """D, its exact gradient, and a Gauss-Newton Hessian that leaves out how det(dT/dx) changes.
 
-        The samples' tensors h g g^T are summed over blocks of 2^3 voxels: splines several blocks wide hardly tell.
+        The samples' tensors h g g^T are summed over blocks of 4^3 voxels: splines eight voxels per cell hardly tell.
         """
-        u = self._displacement(c)
-        m, g = self._warped(u)
-        through_det = None
-        if self._stretch is None:
-            here = self._metric.evaluate(m, self.share)
-        else:
-            det, f = self._det(c)
-            here = self._metric.evaluate((m + 1000) * det - 1000, self.share)
-            slope = self._sum(here.slope * (m + 1000))
-            through_det = self._stretch.adjoint(slope * cofactor(f))
-            g = g * det.astype(g.dtype)
-        force = np.zeros_like(u)
+        warped = self._at(c)
+        here, g = warped.similarity, warped.gradient
+        through_det: Array | None = None
+        if self._stretch is not None and warped.stretch is not None:
+            shape = warped.stretch.shape[2:]
+            slope = np.bincount(self._block, here.slope * (warped.m + 1000), prod(shape)).reshape(shape)
+            through_det = self._stretch.adjoint(slope * cofactor(warped.stretch))
+            g = g * determinant(warped.stretch).reshape(-1)[self._block].astype(g.dtype)
+        force = np.zeros((3, prod(self.samples.grid.shape)), dtype=g.dtype)
         force[:, self.samples.index] = here.slope * g
         gradient = self._lattice.adjoint(force.reshape(3, *self.samples.grid.shape)).astype(float)
         if through_det is not None:
             gradient += through_det
         pairs = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-        tensor = np.stack([self._sum(here.curvature * g[a] * g[b]) for a, b in pairs]).astype(np.float32)
+        shape = self._coarse.grid.shape
+        sums = [np.bincount(self._coarse_block, here.curvature * g[a] * g[b], prod(shape)) for a, b in pairs]
+        tensor = np.stack(sums).reshape(6, *shape).astype(np.float32)
         diagonal = self._coarse.adjoint_squared(tensor[[0, 3, 5]])
         return Model(here.value, gradient, _tensor_product(self._coarse, tensor), diagonal)
 
-    def _displacement(self, c: Array) -> Array:
-        return np.ascontiguousarray(self._lattice.forward(c).reshape(3, -1))
+    def _at(self, c: Array) -> _Warped:
+        """The moving image seen through T at c."""
+        if self._last is None or not np.array_equal(self._last[0], c):
+            u = np.ascontiguousarray(self._lattice.forward(c).reshape(3, -1))
+            m, g = warp_samples(self._moving.hu, self._base, u, self.samples.index, self._a)
+            stretch, mass = None, m
+            if self._stretch is not None:
+                stretch = self._stretch.gradient(c)
+                mass = (m + 1000) * determinant(stretch).reshape(-1)[self._block] - 1000
+            self._last = c.copy(), _Warped(m, g, self._metric.evaluate(mass, self.share), stretch)
+        return self._last[1]
 
-    def _warped(self, u: Array) -> tuple[Array, Array]:
-        return warp_samples(self._moving.hu, self._base, u, self.samples.index, self._a)
 
-    def _det(self, c: Array) -> tuple[Array, Array]:
-        """det(dT/dx) of each sample's block, (n,), and the blocks' gradients."""
-        assert self._stretch is not None
-        f = self._stretch.gradient(c)
-        return determinant(f).reshape(-1)[self._block], f
+@dataclass(frozen=True)
+class _Warped:
+    """m, gradient: (n,), (3, n) moving values and their gradients by u; stretch: dT/dx on the blocks, where asked."""
 
-    def _sum(self, values: Array) -> Array:
-        """Sums of the samples' values (n,) over the blocks, (bi, bj, bk)."""
-        shape = self._coarse.grid.shape
-        return np.bincount(self._block, values, int(np.prod(shape))).reshape(shape)
+    m: Array
+    gradient: Array
+    similarity: Similarity
+    stretch: Array | None
+
+
+def _mapped(prior: PointMap, samples: Samples) -> Array:
+    """P (n, 3) at the samples."""
+    points = samples.points()
+    if is_separable(prior, samples.grid):
+        return points + prior.dense(samples.grid).vectors.reshape(-1, 3)[samples.index]
+    return prior(points)
 
 
 def _tensor_product(lattice: Lattice, t: Array) -> Callable[[Array], Array]:

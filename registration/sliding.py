@@ -9,18 +9,23 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from scipy import ndimage
 
 from registration.ffd import FfdFit, FfdSettings, chosen_metric, register_ffd
 from registration.field import PointMap
 from registration.interpolate import interpolate
+from registration.nearby import bounding_box, grown, near
 from registration.pyramid import Images, Pyramid
 from registration.resample import coarsen, coarsen_mask, resample_mask
-from registration.volume import Array, Mask, Volume
+from registration.volume import Cut, Mask, Volume
 
+COARSE_STEPS = 100
 OUTSIDE_HU = -1100.0
 BEYOND_MM = 5.0
 LAST_LEVELS = 2
+AROUND_MM = 20.0
+"""What is kept around the lungs: more than they grow by, and more than voxels are blurred by."""
+REACH_MM = 50.0
+"""How far from the moving lung the first registrations may look."""
 DEEP_MM = 8.0
 """Nearer to the wall than this a lung shows hardly any vessel, but the wall itself, which slides."""
 
@@ -47,13 +52,17 @@ def register_sliding(
     """
     if fixed_lung is None:
         fixed_lung = _carried(fixed, moving, moving_lung, settings, seen, prior)
-    prior = _first(fixed, moving, fixed_lung, settings, seen, prior, progress)
+    cut = _around(fixed_lung, AROUND_MM)
+    fixed, fixed_lung = fixed.part(cut), fixed_lung.part(cut)
+    seen = None if seen is None else seen.part(cut)
+    prior = _first(fixed, moving.part(_around(moving_lung, REACH_MM)), fixed_lung, settings, seen, prior, progress)
+    cut = _around(moving_lung, AROUND_MM)
     region = grown(fixed_lung, BEYOND_MM)
     if seen is not None:
         region = Mask(region.inside & seen.inside, region.ras_from_ijk)
     return register_ffd(
         masked(fixed, fixed_lung),
-        masked(moving, moving_lung),
+        masked(moving.part(cut), moving_lung.part(cut)),
         replace(settings, levels=min(settings.levels, LAST_LEVELS)),
         fixed_mask=region,
         prior=prior,
@@ -69,16 +78,6 @@ def masked(volume: Volume, lung: Mask) -> Volume:
     return Volume(hu.astype(np.float32), volume.ras_from_ijk)
 
 
-def grown(mask: Mask, distance_mm: float) -> Mask:
-    """Every voxel within `distance_mm` of the mask."""
-    if not mask.inside.any():
-        raise ValueError("the lung mask is empty; check the segmentation")
-    inside = mask.inside.copy()
-    cut = _box(mask.inside, np.ceil(distance_mm / mask.grid.spacing).astype(int))
-    inside[cut] = ndimage.distance_transform_edt(~mask.inside[cut], sampling=mask.grid.spacing) <= distance_mm
-    return Mask(inside, mask.ras_from_ijk)
-
-
 def _first(
     fixed: Volume,
     moving: Volume,
@@ -88,30 +87,38 @@ def _first(
     prior: PointMap | None,
     progress: Callable[[str, float], None] | None,
 ) -> PointMap | None:
-    """Map found on coarser voxels by the whole lung or by its depth, whichever makes the depth look more alike; the
-    prior where nothing lies so deep."""
+    """Map found on coarser voxels by the whole lung or by its depth; the prior where nothing lies so deep.
+
+    Both are found up to twice the finest spacing, and the one under which the depth looks more alike goes on to it.
+    """
     settings = replace(settings, voxel_mm=1.5 * settings.voxel_mm)
     fixed, moving = coarsen(fixed, settings.voxel_mm), coarsen(moving, settings.voxel_mm)
     inside = coarsen_mask(lung, settings.voxel_mm).hu >= 0.5
     shown = np.ones_like(inside) if seen is None else coarsen_mask(seen, settings.voxel_mm).hu >= 0.5
     # Where the scanner's view ends there is no wall, so the depth counts from what it shows outside the lung.
-    depth = ndimage.distance_transform_edt(inside | ~shown, sampling=fixed.grid.spacing)
-    whole, deep = (Mask(inside & shown & (depth > least), fixed.ras_from_ijk) for least in (0.0, DEEP_MM))
+    bare = near(~inside & shown, DEEP_MM, fixed.grid.spacing)
+    whole, deep = (Mask(region & shown, fixed.ras_from_ijk) for region in (inside, inside & ~bare))
     if not deep.inside.any():
         return prior
-    samples = Pyramid(fixed, deep, moving, None).at(settings.voxel_mm)
-    found = [
-        register_ffd(fixed, moving, settings, fixed_mask=region, prior=prior, progress=progress).moving_from_fixed
-        for region in (whole, deep)
-    ]
-    return min(found, key=lambda candidate: _unlikeness(samples, candidate, settings))
+    levels = max(settings.levels - 1, 1)
+    coarse = replace(settings, spacing_mm=2 * settings.spacing_mm, levels=levels, steps=COARSE_STEPS)
+    samples = Pyramid(fixed, deep, moving, None, settings.voxel_mm).at(settings.voxel_mm)
+    found = []
+    for region in (whole, deep):
+        fit = register_ffd(fixed, moving, coarse, fixed_mask=region, prior=prior, progress=progress).moving_from_fixed
+        found.append((_unlikeness(samples, fit, settings), region, fit.field.refined()))
+    _, region, start = min(found, key=lambda candidate: candidate[0])
+    fine = replace(settings, levels=1)
+    return register_ffd(
+        fixed, moving, fine, fixed_mask=region, prior=prior, start=start, progress=progress
+    ).moving_from_fixed
 
 
 def _unlikeness(images: Images, found: PointMap, settings: FfdSettings) -> float:
     """Dissimilarity of the samples under a map."""
     m = interpolate(images.moving.hu, images.moving.grid, found(images.samples.points()), OUTSIDE_HU)
     weights = np.ones(len(m), dtype=np.float32)
-    return chosen_metric(images, settings).evaluate(m, weights, with_slope=False).value
+    return chosen_metric(images, settings).evaluate(m, weights).value
 
 
 def _carried(
@@ -128,8 +135,6 @@ def _carried(
     return resample_mask(moving_lung, fixed.grid, first.moving_from_fixed)
 
 
-def _box(inside: Array, margin: Array) -> tuple[slice, slice, slice]:
-    where = [np.flatnonzero(inside.any(axis=tuple({0, 1, 2} - {m}))) for m in range(3)]
-    lo = [max(w[0] - g, 0) for w, g in zip(where, margin, strict=True)]
-    hi = [w[-1] + g + 1 for w, g in zip(where, margin, strict=True)]
-    return (slice(lo[0], hi[0]), slice(lo[1], hi[1]), slice(lo[2], hi[2]))
+def _around(lung: Mask, margin_mm: float) -> Cut:
+    """Slices about a lung."""
+    return bounding_box(lung.inside, np.ceil(margin_mm / lung.grid.spacing).astype(int))

@@ -121,7 +121,7 @@ def _pairs(
     """Pairs at 8, 4 and 2 mm, each coarsened from the finer one, with samples around the spine that the image shows."""
     everywhere = Mask(np.ones(moving.hu.shape, dtype=bool), moving.ras_from_ijk)
     seen = coarsen_mask(moving_seen or everywhere, 2.0)
-    images = Pyramid(fixed, spine, moving, moving_seen).at(2.0)
+    images = Pyramid(fixed, spine, moving, moving_seen, 2.0).at(2.0)
     low, high = BONE_WINDOW
     fixed, moving = coarsen(fixed, 2.0), images.moving
     shown = None if fixed_seen is None else coarsen_mask(fixed_seen, 2.0)

@@ -9,6 +9,7 @@ import numpy as np
 
 from registration.banded import Banded, along_axes
 from registration.bspline import basis_derivative
+from registration.corrected import is_separable
 from registration.field import PointMap
 from registration.volume import Array, Grid
 
@@ -19,7 +20,8 @@ FLOOR = 0.02
 class Stretch:
     """Gradient F = dT/dx of the whole map on the centres of a block grid.
 
-    control: control points of u; blocks: grid parallel to it; prior: P, by central differences over 1 mm.
+    control: control points of u; blocks: grid parallel to it; prior: P, whose own gradient is exact where it is made of
+    splines, and else by central differences over 1 mm.
     """
 
     def __init__(self, control: Grid, blocks: Grid, prior: PointMap) -> None:
@@ -31,9 +33,7 @@ class Stretch:
         self._matrices = [[Banded(m) for m in row] for row in chosen]
         self._transposed = [[Banded(m.T) for m in row] for row in chosen]
         self._ijk_from_ras = control.ijk_from_ras[:3, :3]
-        points = blocks.points().reshape(-1, 3)
-        rows = [(prior(points + 0.5 * e) - prior(points - 0.5 * e)).T for e in np.eye(3)]
-        self._prior = np.stack(rows, axis=1).reshape(3, 3, *blocks.shape)
+        self._prior = _gradient(prior, blocks)
 
     def gradient(self, c: Array) -> Array:
         """F[a, b] = dT_a / dx_b, (3, 3, bi, bj, bk), for coefficients c (3, ni, nj, nk)."""
@@ -48,6 +48,16 @@ class Stretch:
         """Transpose of `change`: (3, 3, bi, bj, bk) -> (3, ni, nj, nk)."""
         along = np.einsum("abijk,mb->amijk", p, self._ijk_from_ras, optimize=True)
         return np.sum([along_axes(along[:, m], self._transposed[m]) for m in range(3)], axis=0)
+
+
+def _gradient(prior: PointMap, blocks: Grid) -> Array:
+    """dP_a / dx_b, (3, 3, bi, bj, bk)."""
+    if is_separable(prior, blocks):
+        below = Stretch(prior.field.control, blocks, prior.prior)
+        return below.gradient(np.moveaxis(prior.field.coefficients, 3, 0))
+    points = blocks.points().reshape(-1, 3)
+    rows = [(prior(points + 0.5 * e) - prior(points - 0.5 * e)).T for e in np.eye(3)]
+    return np.stack(rows, axis=1).reshape(3, 3, *blocks.shape)
 
 
 def determinant(f: Array) -> Array:

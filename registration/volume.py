@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[Any]
+Cut = tuple[slice, slice, slice]
 
 
 @dataclass(frozen=True)
@@ -60,13 +61,17 @@ class Grid:
 
     def box(self, lower_ijk: Array, upper_ijk: Array) -> Grid:
         """Sub-grid of voxels lower <= ijk < upper, clipped to this grid."""
-        cut = self.cut(lower_ijk, upper_ijk)
+        return self.part(self.cut(lower_ijk, upper_ijk))
+
+    def part(self, cut: Cut) -> Grid:
+        """Sub-grid of the voxels of three slices."""
+        spans = [span.indices(n) for span, n in zip(cut, self.shape, strict=True)]
         affine = self.ras_from_ijk.copy()
-        affine[:3, 3] = self.to_ras(np.array([float(span.start) for span in cut]))
-        i, j, k = (span.stop - span.start for span in cut)
+        affine[:3, 3] = self.to_ras(np.array([float(start) for start, _, _ in spans]))
+        i, j, k = (stop - start for start, stop, _ in spans)
         return Grid((i, j, k), affine)
 
-    def cut(self, lower_ijk: Array, upper_ijk: Array) -> tuple[slice, slice, slice]:
+    def cut(self, lower_ijk: Array, upper_ijk: Array) -> Cut:
         """Where `box` lies in this grid's arrays."""
         lo = np.clip(np.floor(lower_ijk), 0, self.shape).astype(int)
         hi = np.clip(np.ceil(upper_ijk), lo, self.shape).astype(int)
@@ -117,6 +122,10 @@ class Volume(_OnGrid):
     def _values(self) -> Array:
         return self.hu
 
+    def part(self, cut: Cut) -> Volume:
+        """The voxels of three slices."""
+        return Volume(self.hu[cut], self.grid.part(cut).ras_from_ijk)
+
 
 @dataclass(frozen=True, repr=False)
 class Mask(_OnGrid):
@@ -133,6 +142,10 @@ class Mask(_OnGrid):
 
     def _values(self) -> Array:
         return self.inside
+
+    def part(self, cut: Cut) -> Mask:
+        """The voxels of three slices."""
+        return Mask(self.inside[cut], self.grid.part(cut).ras_from_ijk)
 
 
 def axis_codes(ras_from_ijk: Array) -> str:

@@ -10,10 +10,11 @@ from numpy.testing import assert_allclose
 
 from registration.bspline import BSplineField, control_grid
 from registration.ffd import FfdSettings, Weights, register_ffd
+from registration.nearby import grown
 from registration.newton import Stop
 from registration.penalties import Keypoints
 from registration.rigid import RigidTransform
-from registration.sliding import grown, masked, register_sliding
+from registration.sliding import masked, register_sliding
 from registration.volume import Array, Grid, Mask, Volume
 from tests.registration.scenes import image_of, make_pattern, oriented
 

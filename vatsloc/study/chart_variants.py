@@ -7,12 +7,14 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any, cast
 
-from registration.ffd import CorrectedMap, FfdFit, FfdSettings, register_ffd
+from registration.corrected import CorrectedMap
+from registration.ffd import FfdFit, FfdSettings, register_ffd
 from registration.field import PointMap, compose
+from registration.nearby import grown
 from registration.newton import Stop
 from registration.resample import coarsen, resample_mask
 from registration.rigid import RigidTransform
-from registration.sliding import BEYOND_MM, grown, masked, register_sliding
+from registration.sliding import BEYOND_MM, masked, register_sliding
 from registration.volume import Mask, Volume
 from vatsloc.errors import CaseError
 from vatsloc.study.elastix import ElastixSettings, run_elastix
