@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 from registration.volume import Volume
 from tests.vatsloc import imaging_thorax as known
 from vatsloc.errors import InputRefused
-from vatsloc.imaging.cbct import field_of_view, prepare_cbct
+from vatsloc.imaging.cbct import Cupping, field_of_view, prepare_cbct
 from vatsloc.imaging.spine import segment_spine
 
 
@@ -68,8 +68,18 @@ def test_lost_contrast_is_given_back() -> None:
     raw = known.cone_beam(squeezed, (30.0, -20.0), 100.0, (-50.0, 0.0)).hu[seen]
     assert_allclose(done.removed.before["lung"], np.median(raw), atol=30.0)
     assert_allclose(done.removed.after["lung"], -850.0, atol=30.0)
+    entry = done.removed.entry()
+    assert_allclose(entry["gain"], 0.8, atol=0.03)
+    assert_allclose([entry["hu_before"]["lung"], entry["hu_after"]["lung"]], [np.median(raw), -850.0], atol=30.0)
+    assert entry["end_slices_mm"] == 12.0
     lung = known.thorax().lungs["right"].inside & done.field.usable.inside
     assert_allclose(np.median(done.volume.hu[lung]), -850.0, atol=30.0)
+
+
+def test_a_tissue_that_is_not_seen_is_none_in_the_entry() -> None:
+    nowhere = {"air": np.nan, "lung": -850.0, "soft": 40.0}
+    entry = Cupping(np.zeros(2), np.zeros(2), 1.0, nowhere, nowhere).entry()
+    assert entry["hu_before"] == {"air": None, "lung": -850.0, "soft": 40.0}
 
 
 def test_spine_is_the_column_of_vertebrae_in_ct_and_cbct() -> None:

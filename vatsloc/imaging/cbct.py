@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy import ndimage
@@ -46,6 +47,21 @@ class Cupping:
     def at(self, radius_mm: Array) -> Array:
         """HU that the artefact adds at a distance from the axis in mm."""
         return np.interp(radius_mm, self.radius_mm, self.hu)
+
+    def entry(self) -> dict[str, Any]:
+        """What was removed, for run.json: the profile's knots, the gain, HU of each tissue (None: not seen)."""
+
+        def seen(hu: dict[str, float]) -> dict[str, float | None]:
+            return {tissue: None if np.isnan(value) else value for tissue, value in hu.items()}
+
+        return {
+            "cupping_radius_mm": self.radius_mm,
+            "cupping_hu": self.hu,
+            "gain": self.gain,
+            "end_slices_mm": END_SLICES_MM,
+            "hu_before": seen(self.before),
+            "hu_after": seen(self.after),
+        }
 
 
 @dataclass(frozen=True)

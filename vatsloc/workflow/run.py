@@ -178,6 +178,10 @@ def _record(case: Case, found: Localization, settings: Settings, stages: Stages)
             "side": case.side,
             "gravity_ras": case.gravity_ras,
             "solid": found.collapse.model.solid.entry(),
+            "cbct_preparation": {
+                "inflated": found.prepared.inflated.removed.entry(),
+                "deflated": found.prepared.deflated.removed.entry(),
+            },
             "residuals": _residuals(found),
         },
     )
