@@ -155,11 +155,15 @@ def _on(values: Array, at: Mask | Volume, lattice: Lattice) -> Array:
 
 
 def _lung_tissue(ct: Volume, lung: Mask) -> Lattice:
-    """HU of the lung on a lattice of 1 mm; at its border and beyond that of the nearest tissue well inside."""
+    """HU of the lung on a lattice as fine as the scan's pixels, but not finer than 1 mm; at the border and beyond, that
+    of the nearest tissue well inside."""
+    spacing = max(1.0, float(ct.grid.spacing.min()))
     box = lung.grid.to_ras(np.argwhere(lung.inside))
-    lattice = lattice_over(box.min(axis=0) - 8, box.max(axis=0) + 8, 1.0)
+    lattice = lattice_over(box.min(axis=0) - 8, box.max(axis=0) + 8, spacing)
     hu = _on(ct.hu, ct, lattice)
-    inner = ndimage.binary_erosion(_on(lung.inside.astype(np.float32), lung, lattice) > 0.5, iterations=2)
+    inner = ndimage.binary_erosion(
+        _on(lung.inside.astype(np.float32), lung, lattice) > 0.5, iterations=max(round(2 / spacing), 1)
+    )
     nearest = ndimage.distance_transform_edt(~inner, return_distances=False, return_indices=True)
     return lattice.like(hu[tuple(nearest)])
 
@@ -187,14 +191,17 @@ def _corners(patient: Patient) -> Array:
     Ref: Foerstner 1987 (det / trace of the structure tensor).
     """
     tissue = patient.parenchyma
-    smooth = ndimage.gaussian_filter(np.minimum(tissue.values, 0.0), 1.2)
+    voxel = tissue.spacing
+    smooth = ndimage.gaussian_filter(np.minimum(tissue.values, 0.0), max(1.2 / voxel, 0.6))
     slopes = np.gradient(smooth)
-    products = {(a, b): ndimage.gaussian_filter(slopes[a] * slopes[b], 2.0) for a in range(3) for b in range(a, 3)}
+    products = {
+        (a, b): ndimage.gaussian_filter(slopes[a] * slopes[b], 2.0 / voxel) for a in range(3) for b in range(a, 3)
+    }
     tensor = np.stack([products[min(a, b), max(a, b)] for a in range(3) for b in range(3)], axis=-1)
     strength = np.linalg.det(tensor.reshape(*tissue.values.shape, 3, 3)) / np.maximum(
         tensor[..., 0] + tensor[..., 4] + tensor[..., 8], 1e-6
     )
-    peak = strength == ndimage.maximum_filter(strength, size=7)
+    peak = strength == ndimage.maximum_filter(strength, size=max(round(7 / voxel), 3))
     points = tissue.origin + tissue.spacing * np.argwhere(peak)
     power = strength[peak]
     inner = (patient.lung.at(points) < -6.0) & (patient.nodule.distance(points) > 5.0)

@@ -16,7 +16,7 @@ from phantoms.lobes import Fissures
 from phantoms.measures import fissure_jump, lobe_overlap
 from registration.volume import Volume, axis_codes
 
-COARSE = PhantomSpec("coarse", "left", ct_spacing=(4.0, 4.0, 4.0), cbct_spacing=(4.0, 4.0, 4.0), element=24.0)
+COARSE = PhantomSpec("coarse", "left", ct_spacing=(4.0, 4.0, 4.0), cbct_spacing=(4.0, 4.0, 4.0), element=28.0)
 
 
 def _states(case: PhantomCase) -> list[tuple[str, State, Volume]]:
