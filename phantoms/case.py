@@ -22,6 +22,8 @@ from phantoms.tissue import Equilibrium
 from registration.volume import Grid, Mask, Volume
 
 Array = NDArray[Any]
+CT_BLUR_MM = 0.7
+"""Standard deviation of a diagnostic scanner's point spread."""
 
 
 @dataclass(frozen=True)
@@ -139,6 +141,7 @@ def _ct(thorax: Thorax, patient: Patient, spec: PhantomSpec, rng: np.random.Gene
     hu = body + coverage(distance, width) * (tissue - body)
     draw_lung_trees(hu, thorax.trees[thorax.index(spec.side)], grid, width)
     paint_nodule(hu, grid, patient.nodule, width)
+    hu = ndimage.gaussian_filter(hu, CT_BLUR_MM / grid.spacing)
     noise = ndimage.gaussian_filter(rng.standard_normal(grid.shape, dtype=np.float32), 0.5)
     hu += noise * (14.0 / noise.std())
     affine = grid.ras_from_ijk

@@ -78,8 +78,8 @@ def draw_bones(hu: Array, grid: Grid, build: Build, spine: list[Vertebra], rng: 
             draw_tubes(marrow, grid, ends[hard], radii[hard] - 1.7, width)
         draw_tubes(cartilage, grid, ends[~hard], radii[~hard], width)
     hu += cartilage * (110 - hu)
-    hu += bone * (820 - hu)
-    hu += marrow * (230 - hu)
+    hu += bone * (780 - hu)
+    hu += marrow * (200 - hu)
 
 
 def cage_point(build: Build, side: int, angle: Array, z: Array, outward_mm: float | Array) -> Array:
@@ -169,7 +169,7 @@ def _draw_vertebra(hu: Array, grid: Grid, v: Vertebra, width: float) -> None:
     view += coverage(disc, width) * (85 - view)
     view += coverage(np.maximum(canal - 8.2, np.abs(z) - v.height), width) * (25 - view)
     for part, inner in ((solid, v.marrow), (arch, v.marrow + 120)):
-        view += coverage(part, width) * (620 - view)
+        view += coverage(part, width) * (560 - view)
         view += coverage(part + 1.6, width) * (inner - view)
 
 

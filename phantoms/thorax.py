@@ -291,5 +291,5 @@ def _parenchyma(shapes: Shapes, rng: np.random.Generator) -> Lattice:
     coarse, fine = smooth_noise(lattice, 14.0, rng), smooth_noise(lattice, 3.5, rng)
     dependent = -0.35 * (y + 10)
     rind = np.minimum(np.abs(shapes.right_lung.values), np.abs(shapes.left_lung.values))
-    hu = -858 + dependent + 9 * coarse + 15 * np.clip(fine, -1.5, 3) + 12 * np.exp(-rind / 4)
+    hu = -882 + dependent + 9 * coarse + 15 * np.clip(fine, -1.5, 3) + 12 * np.exp(-rind / 4)
     return lattice.like(ndimage.gaussian_filter(np.clip(hu, -940, -600), 0.4))

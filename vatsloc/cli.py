@@ -115,6 +115,12 @@ def phantom(
         Path | None, typer.Option(metavar="DIR", help="Write every case of the suite; those there are kept.")
     ] = None,
     jobs: Annotated[int, typer.Option(metavar="N", min=1, help="Cases of the suite made at once.")] = 1,
+    sheet: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Contact sheet of the suite to write, PNG or JPEG.")
+    ] = None,
+    beside: Annotated[
+        Path | None, typer.Option(metavar="CASE", help="Case made from a real scan that the sheet shows first.")
+    ] = None,
     from_ct: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Chest CT to make a twin of, collapsed like NAME if given.")
     ] = None,
@@ -132,11 +138,15 @@ def phantom(
     scan: collapsed, or breathing."""
     from vatsloc.phantom_case import side_named, write_phantom, write_twin
     from vatsloc.phantom_series import write_series
+    from vatsloc.study.contact_sheet import write_sheet
     from vatsloc.study.suite import table, write_suite
 
     moving = side_named(side)
     if suite is not None and (name, out, from_ct) == (None, None, None):
-        print(table(write_suite(suite, jobs, say)))
+        made = write_suite(suite, jobs, say)
+        if sheet is not None:
+            write_sheet([suite / case for case in made], sheet, beside=beside)
+        print(table(made))
     elif suite is None and out is not None and from_ct is not None:
         if series is None:
             write_twin(from_ct, moving, out, name, seed, nodule, say)

@@ -163,7 +163,8 @@ def test_landmarks_lie_on_structures_in_every_image(demo: PhantomCase) -> None:
 def test_tissues_have_their_densities(demo: PhantomCase) -> None:
     ct = demo.ct
     lung = ndimage.binary_erosion(demo.masks["lung_ct"].inside, iterations=3)
-    assert -870 < np.median(ct.hu[lung]) < -800
+    # Real scans (see test_densities): -888 to -876.
+    assert -900 < np.median(ct.hu[lung]) < -850
     assert 30 < np.median(ct.hu[(ct.hu > 0) & (ct.hu < 150)]) < 60
     assert np.percentile(ct.hu, 99.5) > 300
     deflated = ndimage.binary_erosion(demo.masks["lung_deflated"].inside, iterations=3)
@@ -175,7 +176,7 @@ def test_tissues_have_their_densities(demo: PhantomCase) -> None:
     i, j = (np.indices(gas.shape[:2]) - (gas.shape[0] - 1) / 2) * demo.cbct_deflated.grid.spacing[0]
     inside[np.hypot(i, j) > 110] = False
     assert np.median(demo.cbct_deflated.hu[gas & inside]) < -960
-    assert np.percentile(demo.cbct_deflated.hu[deflated], 5) > -860
+    assert np.percentile(demo.cbct_deflated.hu[deflated], 5) > -900
 
 
 def test_headers_agree_within_what_a_case_may_ask(demo: PhantomCase) -> None:

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
 import pytest
 
 from phantoms import SPECS, SUITE, PhantomCase
+from vatsloc.errors import CaseError
 from vatsloc.phantom_case import read_info, recipe, write_phantom
+from vatsloc.report.planes import box_of
 from vatsloc.study import suite
+from vatsloc.study.contact_sheet import HEIGHT, LABEL, write_sheet
 
 
 def test_suite_covers_the_clinic() -> None:
@@ -41,3 +45,16 @@ def test_a_case_that_is_there_is_kept_and_tabled(
     row = suite.table(made).splitlines()[2]
     assert f"| {demo.info['pose_mm'][0]:.1f} / {demo.info['pose_mm'][1]:.1f} |" in row
     assert f"| {100 * demo.info['affine_share'][1]:.0f} |" in row
+    sheet = tmp_path / "sheet.png"
+    write_sheet([tmp_path / "demo"] * 3, sheet)
+    picture = cv2.imread(str(sheet), cv2.IMREAD_GRAYSCALE)
+    assert picture is not None
+    assert picture.shape[0] == 2 * (HEIGHT + LABEL)
+    lower, upper = box_of(demo.ct.grid)
+    scale = HEIGHT / (upper - lower)[1]
+    column, line = (upper - demo.nodule_ct)[:2] * scale
+    # Flesh is brighter than lung: 25 HU in the window from -1150 to 350, and -880 beside it.
+    assert picture[LABEL + round(line), round(column)] == pytest.approx(200, abs=15)
+    assert picture[LABEL + round(line - 16 * scale), round(column)] < 100
+    with pytest.raises(CaseError, match="is no picture's name"):
+        write_sheet([tmp_path / "demo"], tmp_path / "sheet.txt")
