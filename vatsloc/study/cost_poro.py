@@ -72,8 +72,11 @@ def measure_sizes(sizes: tuple[int, ...], say: Callable[[str], None]) -> list[Ro
 
 
 def exponent(rows: list[Row], kind: str, stage: str) -> float | None:
-    """Least-squares slope of log seconds or MB (`kind`) of a stage against log tetrahedra; None below two sizes."""
-    pairs = [(row["tets"], row[kind][stage]) for row in rows if row[kind].get(stage, 0) > 0]
+    """Least-squares slope of log seconds or MB (`kind`) of a stage against log tetrahedra, over the sizes that are
+    factored; None below two.
+    """
+    factored = [row for row in rows if row["solver"] == "factor"]
+    pairs = [(row["tets"], row[kind][stage]) for row in factored if row[kind].get(stage, 0) > 0]
     if len(pairs) < 2:
         return None
     tets, values = np.array(pairs).T
