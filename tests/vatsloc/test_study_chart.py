@@ -250,6 +250,8 @@ def test_the_chart_s_files_hold_its_numbers(tmp_path: Path) -> None:
     assert svg.startswith("<?xml")
     assert (tmp_path / "chart.png").stat().st_size > 20_000
     text = page(ROWS, points_of(ROWS, VARIANTS))
+    assert "| alone | 2.00 / 4.00; 2.00 |  |" in text
+    assert "| fast | 0.90 / 2.00; 0.60 | 0.70 / 1.60; 0.40 |" in text
     assert "| fast | preset fast | 0.90 | 2.20 | 24.0 | 2 | mean, 95 % |" in text
     assert "- alone on b: the contact did not settle" in text
 

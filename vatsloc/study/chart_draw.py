@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from importlib.util import find_spec
@@ -69,11 +70,25 @@ def page(rows: Sequence[Row], points: Sequence[Point], clock: str = "seconds") -
             front = ", ".join(MEASURES[m] for m in p.front)
             lines.append(f"| {p.variant} | {p.says} | {p.mean:.2f} | {p.p95:.2f} | {p.seconds:.1f} | {p.n} | {front} |")
         lines.append("")
+    lines += ["### Phase 2 by case, mean / 95 % at the landmarks; nodule, mm", "", *by_case(rows, cases), ""]
     lines += ["### Presets", "", *(f"- {sentence}" for sentence in told_of_presets(points)), ""]
     failed = [row for row in rows if row.failed]
     if failed:
         lines += ["### Without an answer", "", *(f"- {row.variant} on {row.case}: {row.failed}" for row in failed), ""]
     return "\n".join(lines)
+
+
+def by_case(rows: Sequence[Row], cases: Sequence[str]) -> list[str]:
+    """Lines of a Markdown table: every variant that deforms the collapsing lung on every case."""
+    found = {(row.variant, row.case): row for row in rows if not math.isnan(row.phase2_mean)}
+    lines = [f"| variant | {' | '.join(cases)} |", "|---" * (len(cases) + 1) + "|"]
+    for variant in dict.fromkeys(variant for variant, _ in found):
+        cells = []
+        for case in cases:
+            row = found.get((variant, case))
+            cells.append("" if row is None else f"{row.phase2_mean:.2f} / {row.phase2_p95:.2f}; {row.nodule_mm:.2f}")
+        lines.append(f"| {variant} | {' | '.join(cells)} |")
+    return lines
 
 
 def interactive(rows: Sequence[Row], variants: Mapping[str, Variant], clock: str = "seconds") -> str:

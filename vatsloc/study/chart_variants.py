@@ -122,6 +122,9 @@ VARIANTS: dict[str, Variant] = {
     "tetrahedra-5": _model("model of 5 mm tetrahedra", edge_mm=5.0),
     "alone": _model("model without residual registration", residual=False),
     "alone-8": _model("model of 8 mm tetrahedra without residual registration", residual=False, edge_mm=8.0),
+    "regional-alone": _model(
+        "model with regional parameters, not corrected, without residual registration", residual=False, correct=False
+    ),
     "no-keypoints": _model("model fitted to the surface alone", keypoints=False),
     "no-keypoints-alone": _model(
         "model fitted to the surface alone, without residual registration", residual=False, keypoints=False
