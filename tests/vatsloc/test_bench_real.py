@@ -86,6 +86,7 @@ def test_scores_of_a_known_motion(person_folder: Path) -> None:
         assert {lung: row["n"] for lung, row in rows[bench.UNMOVED].items()} == {"left": 40, "right": 40, "both": 80}
         assert rows[bench.TRUE_AFFINE]["both"]["max"] < 1e-9
         assert rows[bench.SHAPE_AFFINE]["both"]["mean"] < 1.0
+        assert rows[bench.ELASTIC]["both"]["mean"] < 1.5
     marks = np.loadtxt(person_folder / "landmarks_ras_mm.csv", delimiter=",", skiprows=1)
     moved = np.linalg.norm(marks[:, 3:] - marks[:, :3], axis=1)
     assert result["cases"][0]["rows"][bench.UNMOVED]["both"]["mean"] == pytest.approx(moved.mean())

@@ -8,13 +8,19 @@ from typing import Any
 
 import numpy as np
 
+from poro.correct import correct, pull_of
+from poro.mesh import interpolate, locate
 from poro.mesh.tetmesh import Array
+from poro.observations import Target
+from poro.tissue import Tissue
 from vatsloc.evaluation.statistics import distances, summarize
 from vatsloc.study.affine import affine_to_points, affine_to_shape
 from vatsloc.study.breaths import Motion, Person, read_person
 
 EDGE_MM = 10.0
+PULLS, STRAIN, REACH_MM = 4, 0.02, 25.0
 UNMOVED, CENTROID, SHAPE_AFFINE = "unmoved", "centroid of the shape", "affine map fitted to the shape"
+ELASTIC = "elastic lung that slides on its wall"
 TRUE_AFFINE = "affine map fitted to the landmarks"
 """The last row has seen the truth: it is what a map of twelve numbers per lung can reach at best."""
 
@@ -34,6 +40,20 @@ def by_shape_affine(motion: Motion) -> Array:
     return affine_to_shape(motion.mesh.boundary, motion.onto)(motion.landmarks)
 
 
+def by_sliding_elasticity(motion: Motion) -> Array:
+    """Landmarks in an elastic lung whose surface, laid on the other by the affine map, is pulled onto it along the
+    normals alone, so that it slides.
+    """
+    mesh, onto = motion.mesh, motion.onto
+    u = affine_to_shape(mesh.boundary, onto)(mesh.points) - mesh.points
+    wall = Target(onto.points, onto.node_normals, np.ones(len(onto.points)))
+    for number in range(PULLS):
+        pull = pull_of(wall, mesh, u, correlation_mm=EDGE_MM, reach_mm=REACH_MM)
+        robust = 3.0 if number == PULLS - 1 else np.inf
+        u = u + correct(mesh, u, Tissue(), pull, STRAIN, robust, rounds=1).u
+    return motion.landmarks + interpolate(locate(mesh, motion.landmarks), u)
+
+
 def by_true_affine(motion: Motion) -> Array:
     """Landmarks moved by the affine map fitted to them."""
     return affine_to_points(motion.landmarks, motion.truth)(motion.landmarks)
@@ -43,6 +63,7 @@ ROWS: dict[str, Predict] = {
     UNMOVED: lambda motion: motion.landmarks,
     CENTROID: by_centroid,
     SHAPE_AFFINE: by_shape_affine,
+    ELASTIC: by_sliding_elasticity,
     TRUE_AFFINE: by_true_affine,
 }
 
