@@ -99,6 +99,17 @@ def test_a_rung_that_predicts_what_it_has_not_seen_is_taken_and_follows_all_pair
     )
 
 
+def test_a_step_that_fails_with_all_pairs_gives_way_to_the_next_best(still: Model, surface: Target) -> None:
+    everything = len(still.pairs)
+
+    def fails(model: Model, target: Target, start: Fit) -> Model:
+        return model if len(target.inflated) == everything else corrected(0.05)(model, target, start)
+
+    model, _ = best_of({"fails": fails, "holds": corrected(0.0125)}, still, still, surface)
+    assert {rung.name: rung.kept for rung in model.rungs} == {"fails": False, "holds": True}
+    assert np.abs(model.displacement).max() > 1.0
+
+
 def test_noise_alone_is_not_worth_a_rung(still: Model) -> None:
     boundary = still.system.mesh.boundary
     stays = Target(boundary.points, boundary.node_normals, np.ones(len(boundary.points)))

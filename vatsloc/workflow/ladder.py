@@ -114,22 +114,22 @@ def climb(gravity: Array, prepared: Prepared, observed: Observed, settings: Sett
 
 
 def best_of(steps: dict[str, Step], model: Model, blind: Model, surface: Target) -> tuple[Model, Model]:
-    """Steps are first tried on the model that has not seen the hidden pairs. The one that predicts them best is taken,
-    if that is better than without, and taken again with all pairs for the model proper.
+    """Steps are first tried on the model that has not seen the hidden pairs. The one that predicts them best, if better
+    than without, is taken again with all pairs for the model proper; where that fails, the next best is.
     """
     mesh, hidden = model.system.mesh, held_back(model.pairs.second)
     unseen, shown = model.pairs.only(hidden), _with(surface, model.pairs.only(~hidden))
     trials = {name: step(blind, shown, blind.fit) for name, step in steps.items()}
     before = misfit(mesh, blind.displacement, unseen)
     after = {name: misfit(mesh, trial.displacement, unseen) for name, trial in trials.items() if _settled(trial)}
-    best = min(after, key=lambda name: after[name], default="")
-    if best and after[best] < GAIN * before:
-        found = steps[best](model, _with(surface, model.pairs), trials[best].fit)
-        taken = _settled(found)
-    else:
-        found, taken = model, False
-    rungs = (*model.rungs, *(Rung(name, before, mm, taken and name == best) for name, mm in after.items()))
-    return (replace(found, rungs=rungs), trials[best]) if taken else (replace(model, rungs=rungs), blind)
+    best = None
+    for name in sorted((name for name, mm in after.items() if mm < GAIN * before), key=lambda name: after[name]):
+        found = steps[name](model, _with(surface, model.pairs), trials[name].fit)
+        if found is not model and _settled(found):
+            best, model, blind = name, found, trials[name]
+            break
+    rungs = (*model.rungs, *(Rung(name, before, mm, name == best) for name, mm in after.items()))
+    return replace(model, rungs=rungs), blind
 
 
 def _settled(model: Model) -> bool:
@@ -223,7 +223,7 @@ def _regional(gravity: Array, settings: Settings) -> Step:
 
 
 def corrected(strain: float) -> Step:
-    """An elastic field on top, or none where that would turn more elements inside out."""
+    """An elastic field on top; the model itself where that would turn more elements inside out."""
 
     def step(model: Model, target: Target, _start: Fit) -> Model:
         mesh = model.system.mesh
