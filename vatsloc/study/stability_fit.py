@@ -18,6 +18,7 @@ from registration.volume import Array
 from vatsloc.case import Case, read_case
 from vatsloc.errors import VatslocError
 from vatsloc.evaluation.inputs import Truth, read_truth
+from vatsloc.study.cohort import SILENT_MM
 from vatsloc.study.tables import Row, markdown
 from vatsloc.workflow.ladder import fit_settings, surface_target
 from vatsloc.workflow.localize import conclude
@@ -28,7 +29,6 @@ from vatsloc.workflow.prepare import Prepared, prepare
 from vatsloc.workflow.settings import Settings
 from vatsloc.workflow.stages import Say, Stages, quiet
 
-SILENT_MM = 10.0
 VERTEBRA_MM = 22.0
 STARTS = 50
 NAMES = ("log10 kappa_b", "phi", "d_diaph mm")

@@ -69,9 +69,9 @@ class Model:
 
     @property
     def held_back_mm(self) -> float | None:
-        """Median misfit at places held back from the last rung that was kept; None without keypoints."""
-        kept = [rung.after_mm for rung in self.rungs if rung.kept] + [rung.before_mm for rung in self.rungs[:1]]
-        return min(kept, default=None)
+        """Median misfit at places held back from the last rung that was kept, or from the plain fit; None untried."""
+        known = [rung.before_mm for rung in self.rungs[:1]] + [rung.after_mm for rung in self.rungs if rung.kept]
+        return known[-1] if known else None
 
 
 Step = Callable[[Model, Target, Fit], Model]
