@@ -24,7 +24,8 @@ class Collapse:
     diaphragm rises further when the lung collapses, negative where insufflated gas pushes it down; shift: mm the
     mediastinum falls; gas: "air" or "co2"; patchiness: factor on how uneven the tissue is; atelectasis: share of the
     lung, behind and below, that has lost its gas before the first cone-beam CT; lobes_apart: deviation of the logarithm
-    of the lobes' rest volumes, where one traps gas and another empties."""
+    of the lobes' rest volumes, where one traps gas and another empties; stiffness: factor on the shear modulus; root:
+    factor on how firmly the lung's root is held to the mediastinum and on how much stiffer it is than the rest."""
 
     inflated: float = 0.87
     deflated: float = 0.52
@@ -34,6 +35,8 @@ class Collapse:
     patchiness: float = 1.0
     atelectasis: float = 0.0
     lobes_apart: float = 0.0
+    stiffness: float = 1.0
+    root: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -107,6 +110,13 @@ SPECS = {
             view=(36.0, 0.0, -44.0),
             refused=True,
             scanner=Scanner(fov=120.0, length=80.0),
+        ),
+        PhantomSpec(
+            "stiff-lung",
+            "right",
+            collapse=Collapse(
+                inflated=0.91, deflated=0.58, dome_rise=14.0, shift=22.0, patchiness=0.0, stiffness=4.0, root=0.01
+            ),
         ),
     )
 }

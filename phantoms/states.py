@@ -20,6 +20,8 @@ from phantoms.tissue import Equilibrium, Hilum, Pleura, Tissue, relax, tissue_po
 Array = NDArray[Any]
 HINGE_MM = 13.0
 """Around the hilum, tissue of a lung in lobes is tied to the mediastinum this far, so that lobes may swing."""
+ROOT_KPA_MM = 300.0
+"""Stiffness a point of the root's tie to the mediastinum."""
 
 
 def make_states(
@@ -53,12 +55,13 @@ def make_states(
 @dataclass(frozen=True)
 class LungBody:
     """The operated lung as a body that settles under loads. surface: points (n, 3) mm, areas (n,), lobes (n,); tied:
-    (n,) the tissue that belongs to the hilum."""
+    (n,) the tissue that belongs to the hilum; root: factor on how firmly it is held."""
 
     patient: Patient
     tissue: Tissue
     surface: tuple[Array, Array, Array]
     tied: Array
+    root: float
     element_mm: float
 
     def settle(
@@ -67,7 +70,7 @@ class LungBody:
         """The lung's room after the walls' motion, as a signed distance (mm), and the lung at rest in it."""
         lung, t = self.patient.lung, self.tissue
         cavity = motion.carry(lung)
-        hilum = Hilum(t.points[self.tied], motion(t.points[self.tied]), 300.0, t.lobe[self.tied])
+        hilum = Hilum(t.points[self.tied], motion(t.points[self.tied]), self.root * ROOT_KPA_MM, t.lobe[self.tied])
         pleura = _pleura(self.surface, lung, cavity, held)
         lobes = self.patient.lobes
         return cavity, relax(t, pleura, hilum, gravity, motion, volume_ratio, self.element_mm, lobes)
@@ -81,7 +84,7 @@ def lung_body(patient: Patient, collapse: Collapse, element_mm: float, rng: np.r
     tied = np.linalg.norm(points - patient.hilum, axis=1) < (20.0 if len(lobes.regions) == 1 else HINGE_MM)
     shear, slack = _uneven(patient, points, lobe, collapse, rng)
     rest = np.cbrt(np.clip(collapse.deflated * slack, 0.15, 0.95))
-    return LungBody(patient, Tissue(points, volume, shear, rest, 165.0, lobe), surface, tied, element_mm)
+    return LungBody(patient, Tissue(points, volume, shear, rest, 165.0, lobe), surface, tied, collapse.root, element_mm)
 
 
 def _by_lobe(parts: list[tuple[Array, Array]]) -> tuple[Array, Array, Array]:
@@ -104,10 +107,10 @@ def _uneven(
     nodule."""
     patchiness = collapse.patchiness
     lung, hilum = patient.lung, patient.hilum
-    shear = 0.65 * np.exp(0.45 * patchiness * lung.like(smooth_noise(lung, 32.0, rng)).at(points))
+    shear = 0.65 * collapse.stiffness * np.exp(0.45 * patchiness * lung.like(smooth_noise(lung, 32.0, rng)).at(points))
     slack = np.exp(0.22 * patchiness * lung.like(smooth_noise(lung, 38.0, rng)).at(points))
     slack *= np.exp(collapse.lobes_apart * _odds(len(patient.lobes.regions), patient.seed))[lobe]
-    shear *= 1 + 5 * np.exp(-((np.linalg.norm(points - hilum, axis=1) / 24) ** 2))
+    shear *= 1 + 5 * collapse.root * np.exp(-((np.linalg.norm(points - hilum, axis=1) / 24) ** 2))
     fissures = patient.lobes.fissures
     shear *= 1 - 0.85 * np.exp(-((fissures.distance(points) / 8) ** 2)) * fissures.grown(points)
     airless = _airless(points, collapse.atelectasis)
