@@ -54,15 +54,17 @@ class Compliance:
         if self._groups is None:
             label = _bisect(points, GROUPS)
             share = 1 / np.bincount(label)
-            motion = _column_means(self.matrix, label, share).reshape(len(label), 3, len(share), 3)
+            motion = _group_means(self.matrix, label, share).reshape(len(label), 3, len(share), 3)
             mean = np.zeros((len(share), *motion.shape[1:]))
             np.add.at(mean, label, motion)
             self._groups = Groups(label, share, motion, mean * share[:, None, None, None])
         return self._groups
 
     def between(self, nodes: Array, along: Array) -> Array:
-        """Motion (k, k) of contact nodes (k,) along directions (k, 3) under unit forces at them along these."""
-        return _between(self.matrix, nodes, along)
+        """Motion (k, k) of contact nodes (k,) along directions (k, 3) under unit forces at them along these; of the
+        matrix's type.
+        """
+        return _between(self.matrix, nodes, along.astype(self.matrix.dtype))
 
     def apply(self, force: Array) -> Array:
         """Displacements (nc, 3) of all contact nodes under forces (nc, 3), most of them zero."""
@@ -86,24 +88,24 @@ def _bisect(points: Array, groups: int) -> Array:
 
 
 @njit(cache=True)
-def _column_means(matrix: Array, label: Array, share: Array) -> Array:
-    result = np.zeros((len(matrix), 3 * len(share)), matrix.dtype)
-    for r in range(len(matrix)):
-        sums = np.zeros(3 * len(share))
-        for n in range(len(label)):
-            for b in range(3):
-                sums[3 * label[n] + b] += matrix[r, 3 * n + b]
-        for g in range(len(share)):
-            for b in range(3):
-                result[r, 3 * g + b] = sums[3 * g + b] * share[g]
-    return result
+def _group_means(matrix: Array, label: Array, share: Array) -> Array:
+    """Means (3 nc, 3 g) of the columns over the groups; of the rows (3 g, 3 nc), rather, the matrix being symmetric."""
+    sums = np.zeros((3 * len(share), matrix.shape[1]), matrix.dtype)
+    for n in range(len(label)):
+        for axis in range(3):
+            total, row = sums[3 * label[n] + axis], matrix[3 * n + axis]
+            for c in range(len(row)):
+                total[c] += row[c]
+    for g in range(len(share)):
+        sums[3 * g : 3 * g + 3] *= matrix.dtype.type(share[g])
+    return sums.T.copy()
 
 
 @njit(cache=True)
 def _between(matrix: Array, nodes: Array, along: Array) -> Array:
-    count, last = len(nodes), 0
-    result = np.empty((count, count))
-    row = np.empty(matrix.shape[1])
+    count, last, tile = len(nodes), 0, 32
+    result = np.empty((count, count), matrix.dtype)
+    row = np.empty(matrix.shape[1], matrix.dtype)
     for i in range(count):
         n = nodes[i]
         last = max(last, 3 * n + 3)
@@ -113,9 +115,11 @@ def _between(matrix: Array, nodes: Array, along: Array) -> Array:
             row[c] = x * first[c] + y * second[c] + z * third[c]
         for j in range(i + 1):
             c = 3 * nodes[j]
-            total = along[j, 0] * row[c] + along[j, 1] * row[c + 1] + along[j, 2] * row[c + 2]
-            result[i, j] = total
-            result[j, i] = total
+            result[i, j] = along[j, 0] * row[c] + along[j, 1] * row[c + 1] + along[j, 2] * row[c + 2]
+    for start in range(0, count, tile):  # by tiles, which stay in the cache
+        for i in range(start, count):
+            for j in range(start, min(start + tile, i)):
+                result[j, i] = result[i, j]
     return result
 
 

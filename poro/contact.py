@@ -140,24 +140,24 @@ class Linearized:
 
         Factored in the compliance's own precision and, where that is single, refined once.
         """
-        own = self.compliance.matrix.dtype
+        own = matrix.dtype
         (factorize,) = get_lapack_funcs(("potrf",), dtype=own)
-        lower, failed = factorize(matrix.T, lower=1, clean=0)
+        upper, failed = factorize(matrix.T, clean=0)
         if failed:
             raise ValueError(f"contact nodes {failed - 1} and an earlier one move alike; the compliance is singular")
-        half = solve_triangular(lower, coupling.astype(own, copy=False), lower=True, check_finite=False)
+        half = solve_triangular(upper, coupling.astype(own, copy=False), trans=1, check_finite=False)
         schur = self.springs.matrix - half.T @ half
 
         def forces(gap: Array, slack: Array) -> tuple[Array, Array]:
-            y = solve_triangular(lower, gap.astype(own, copy=False), lower=True, check_finite=False)
+            y = solve_triangular(upper, gap.astype(own, copy=False), trans=1, check_finite=False)
             pull = solve(schur, half.T @ y - slack) if len(slack) else slack
-            back = solve_triangular(lower, y + half @ pull, lower=True, trans=1, check_finite=False)
+            back = solve_triangular(upper, y + half @ pull, check_finite=False)
             return -np.asarray(back, float), np.asarray(pull, float)
 
         push, pull = forces(offset, self.slack)
         if own == np.float32:
-            left = offset + matrix @ push + coupling @ pull, self.slack + coupling.T @ push + self.springs.matrix @ pull
-            more, stronger = forces(*left)
+            left = offset + matrix @ push.astype(own) + coupling @ pull
+            more, stronger = forces(left, self.slack + coupling.T @ push + self.springs.matrix @ pull)
             push, pull = push + more, pull + stronger
         return push, pull
 

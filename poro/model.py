@@ -181,6 +181,7 @@ def solve(system: PoroSystem, theta: Theta, start: PoroState | None = None, tole
 
 def solve_many(system: PoroSystem, thetas: Sequence[Theta], tolerance_mm: float = 1e-3) -> list[PoroState]:
     """Deflated lungs at many parameter values, each started from the nearest one that is solved already."""
+    system.suction.learn(theta.kappa_b for theta in thetas)
     places = np.array([[np.log10(max(t.kappa_b, KAPPA_B_BOUNDS[0])), 10 * t.phi, t.d_diaph_mm / 5] for t in thetas])
     loads: list[tuple[Array, Array]] = [without_wall(system, theta) for theta in thetas]
     contacts: dict[int, ContactState] = {}

@@ -5,6 +5,7 @@ Ref: Quarteroni, Manzoni & Negri 2016 (reduced basis, residual as the test).
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -46,18 +47,28 @@ class Suction:
 
     def at(self, kappa_b: float) -> Sucked:
         """The lung at kappa_b in 1/(Pa s); raises ValueError for a negative one."""
+        drop, steepening = self._coefficients(kappa_b).T
+        p = np.full(len(self._flow.mesh.points), self._flow.tissue.pleural_kpa)
+        change = np.zeros_like(p)
+        p[self._flow.inner] -= self._basis @ drop
+        change[self._flow.inner] -= self._basis @ steepening
+        response = self._responses()
+        return Sucked(p, change, response @ drop, response @ steepening)
+
+    def learn(self, rates: Iterable[float]) -> None:
+        """Let the basis grow for several kappa_b, so that one elastic solution serves them together."""
+        for kappa_b in rates:
+            self._coefficients(kappa_b)
+
+    def _coefficients(self, kappa_b: float) -> Array:
+        """Coefficients (r, 2) of the drop and of its derivative in the basis, which grows where it does not suffice."""
         found = self._reduced(kappa_b)
         if found is None:
             p, change = self._flow.pressure(kappa_b)
             exact = np.stack([self._flow.tissue.pleural_kpa - p, -change], axis=1)[self._flow.inner]
             self._grow(exact)
             found = self._basis.T @ exact
-        drop, steepening = found.T
-        p = np.full(len(self._flow.mesh.points), self._flow.tissue.pleural_kpa)
-        change = np.zeros_like(p)
-        p[self._flow.inner] -= self._basis @ drop
-        change[self._flow.inner] -= self._basis @ steepening
-        return Sucked(p, change, self._response @ drop, self._response @ steepening)
+        return found
 
     def _reduced(self, kappa_b: float) -> Array | None:
         """Coefficients (r, 2) of the drop and of its derivative in the basis, None where the basis does not suffice."""
@@ -82,13 +93,18 @@ class Suction:
             if np.linalg.norm(column) <= 1e-13 * scale:
                 continue
             self._basis = np.column_stack([self._basis, column / np.linalg.norm(column)])
+        new = self._basis[:, self._stored.shape[1] :]
+        if new.shape[1]:
+            conduction, mass = self._flow.inner_rows
+            self._conducted = np.column_stack([self._conducted, conduction @ new])
+            self._stored = np.column_stack([self._stored, mass @ new])
+
+    def _responses(self) -> Array:
+        """Displacements (n, 3, r) per unit of every field of the basis."""
         new = self._basis[:, self._response.shape[2] :]
-        if new.shape[1] == 0:
-            return
-        conduction, mass = self._flow.inner_rows
-        self._conducted = np.column_stack([self._conducted, conduction @ new])
-        self._stored = np.column_stack([self._stored, mass @ new])
-        whole = np.zeros((len(self._flow.mesh.points), new.shape[1]))
-        whole[self._flow.inner] = -new
-        force = (self._load @ whole).reshape(len(whole), 3, -1)
-        self._response = np.concatenate([self._response, self._solid.solve(force)], axis=2)
+        if new.shape[1]:
+            whole = np.zeros((len(self._response), new.shape[1]))
+            whole[self._flow.inner] = -new
+            force = (self._load @ whole).reshape(len(whole), 3, -1)
+            self._response = np.concatenate([self._response, self._solid.solve(force)], axis=2)
+        return self._response

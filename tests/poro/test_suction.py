@@ -7,7 +7,10 @@ import pytest
 from numpy.testing import assert_allclose
 from shapes import ellipsoid
 
+from poro.mesh.tetmesh import Array
 from poro.model import PoroStatus, PoroSystem, Theta, assemble, solve, solve_many
+from poro.solid import Solid
+from poro.suction import Suction
 from poro.tissue import Tissue
 
 
@@ -55,3 +58,24 @@ def test_many_lungs_equal_lungs_one_by_one(system: PoroSystem) -> None:
         assert_allclose(state.u, alone.u, atol=1e-5)
         assert_allclose(state.p, alone.p, atol=1e-9)
         assert (state.active == alone.active).all()
+
+
+def test_rates_learnt_together_take_one_elastic_solution(system: PoroSystem, monkeypatch: pytest.MonkeyPatch) -> None:
+    rates = (1e-9, 1e-8, 1e-7)
+    alone = [Suction(system.flow, system.solid, system.pressure_load).at(kappa_b) for kappa_b in rates]
+    solved: list[int] = []
+    plain = Solid.solve
+
+    def counted(self: Solid, force: Array, imposed: Array | None = None) -> Array:
+        solved.append(force.shape[2])
+        return plain(self, force, imposed)
+
+    monkeypatch.setattr(Solid, "solve", counted)
+    together = Suction(system.flow, system.solid, system.pressure_load)
+    together.learn(rates)
+    assert together.size == 6
+    for kappa_b, one in zip(rates, alone, strict=True):
+        found = together.at(kappa_b)
+        assert_allclose(found.u, one.u, atol=1e-8 * np.abs(one.u).max())
+        assert_allclose(found.u_change, one.u_change, atol=1e-7 * np.abs(one.u_change).max())
+    assert solved == [6]
