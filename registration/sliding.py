@@ -1,33 +1,36 @@
-"""Registration of a lung that slides along its wall: whole or depth alone first, then masked from what lies around.
+"""Registration of a lung that slides along its wall: led by places inside it, masked from what lies around.
 
-Ref: Wu 2008; Alvarez 2021, section 6.1.4 (the masked images); the order is our own.
+Ref: Wu 2008; Alvarez 2021, section 6.1.4 (the masked images); Polzin 2013 (places found again before the images).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
-from registration.ffd import FfdFit, FfdSettings, chosen_metric, register_ffd
+from registration.ffd import FfdFit, FfdSettings, register_ffd
 from registration.field import PointMap
-from registration.interpolate import interpolate
-from registration.nearby import bounding_box, grown, near
-from registration.pyramid import Images, Pyramid
-from registration.resample import coarsen, coarsen_mask, resample_mask
+from registration.matching import MatchSettings, match_keypoints
+from registration.nearby import bounding_box, grown
+from registration.penalties import Keypoints
+from registration.resample import coarsen, resample, resample_mask
+from registration.rigid import RigidTransform
 from registration.volume import Cut, Mask, Volume
 
-COARSE_STEPS = 100
 OUTSIDE_HU = -1100.0
 BEYOND_MM = 5.0
 LAST_LEVELS = 2
 AROUND_MM = 20.0
 """What is kept around the lungs: more than they grow by, and more than voxels are blurred by."""
-REACH_MM = 50.0
-"""How far from the moving lung the first registrations may look."""
-DEEP_MM = 8.0
-"""Nearer to the wall than this a lung shows hardly any vessel, but the wall itself, which slides."""
+FAR_MM, NEAR_MM = 24.0, 8.0
+"""How far along each axis places are looked for about the prior, and about the first map."""
+HOLD = 0.5
+"""Share of their weight that places keep at the finest levels, where images are nearer than half a voxel."""
+LEAST_PAIRS = 20
+"""Fewer pairs than this may all be chance."""
 
 
 def register_sliding(
@@ -44,30 +47,58 @@ def register_sliding(
     """Free-form deformation of a lung alone, whatever its wall does.
 
     fixed_lung: the lung in the fixed image; without it, a first registration with the metric inside the moving lung
-    (placed by `prior`) carries the moving lung over. seen: field of view of the fixed image. A smooth wall looks alike
-    wherever it has slid to, so it can hold the coarse levels at the prior; without it the depth can run away. Hence two
-    first registrations, of the whole lung and of what lies deeper than 8 mm, and the one under which the depth looks
-    more alike is kept. Then both images are set to -1100 HU outside their lungs and compared inside the fixed lung
-    grown by 5 mm at the two finest levels, so the wall is met and nothing outside can pull.
+    (placed by `prior`) carries the moving lung over. seen: field of view of the fixed image. Both images are set to
+    -1100 HU outside their lungs and compared inside the fixed lung grown by 5 mm, so the wall is met and nothing
+    outside can pull. A smooth wall looks alike wherever it has slid to, and vessels look alike when the map starts far
+    off, so places inside the lung are found first, up to 24 mm off the prior, and lead the coarse levels; found again
+    under that map, they hold the two finest.
     """
     if fixed_lung is None:
         fixed_lung = _carried(fixed, moving, moving_lung, settings, seen, prior)
     cut = _around(fixed_lung, AROUND_MM)
     fixed, fixed_lung = fixed.part(cut), fixed_lung.part(cut)
-    seen = None if seen is None else seen.part(cut)
-    prior = _first(fixed, moving.part(_around(moving_lung, REACH_MM)), fixed_lung, settings, seen, prior, progress)
+    seen = Mask(np.ones_like(fixed_lung.inside), fixed_lung.ras_from_ijk) if seen is None else seen.part(cut)
     cut = _around(moving_lung, AROUND_MM)
-    region = grown(fixed_lung, BEYOND_MM)
-    if seen is not None:
-        region = Mask(region.inside & seen.inside, region.ras_from_ijk)
-    return register_ffd(
-        masked(fixed, fixed_lung),
-        masked(moving.part(cut), moving_lung.part(cut)),
-        replace(settings, levels=min(settings.levels, LAST_LEVELS)),
-        fixed_mask=region,
-        prior=prior,
-        progress=progress,
+    moving, moving_lung = moving.part(cut), moving_lung.part(cut)
+    region = Mask(grown(fixed_lung, BEYOND_MM).inside & seen.inside, fixed.ras_from_ijk)
+    inner = Mask(fixed_lung.inside & seen.inside, fixed.ras_from_ijk)
+    images = masked(fixed, fixed_lung), masked(moving, moving_lung)
+    start = prior or RigidTransform.identity()
+    coarse = replace(
+        settings,
+        spacing_mm=2 * settings.spacing_mm,
+        voxel_mm=1.5 * settings.voxel_mm,
+        levels=max(settings.levels - 1, 1),
     )
+    held = replace(settings.weights, keypoints=HOLD * settings.weights.keypoints)
+    finest = replace(settings, levels=min(settings.levels, LAST_LEVELS), weights=held)
+    alike = (coarsen(image, settings.voxel_mm) for image in (fixed, moving))
+    found = partial(_found_again, *alike, inner, moving_lung, settings.voxel_mm)
+    register = partial(register_ffd, *images, fixed_mask=region, progress=progress)
+    first = register(settings=coarse, prior=start, keypoints=found(start, FAR_MM)).moving_from_fixed
+    return register(settings=finest, prior=first, keypoints=found(first, NEAR_MM))
+
+
+def _found_again(
+    fixed: Volume,
+    moving: Volume,
+    fixed_lung: Mask,
+    moving_lung: Mask,
+    voxel_mm: float,
+    prior: PointMap,
+    reach_mm: float,
+) -> Keypoints | None:
+    """Places inside both lungs that both images show, at most `reach_mm` from where `prior` puts them; None for too
+    few.
+    """
+    pairs = match_keypoints(
+        resample(moving, fixed.grid, prior),
+        fixed,
+        resample_mask(fixed_lung, fixed.grid),
+        MatchSettings(voxel_mm=voxel_mm, reach_mm=reach_mm),
+        first_region=resample_mask(moving_lung, fixed.grid, prior),
+    )
+    return None if len(pairs) < LEAST_PAIRS else Keypoints(pairs.second, prior(pairs.first), np.ones(len(pairs)))
 
 
 def masked(volume: Volume, lung: Mask) -> Volume:
@@ -76,49 +107,6 @@ def masked(volume: Volume, lung: Mask) -> Volume:
         raise ValueError(f"the lung mask must lie on the image's grid: {lung!r} against {volume!r}; resample it first")
     hu = np.where(lung.inside, np.maximum(volume.hu, np.float32(-1000)), np.float32(OUTSIDE_HU))
     return Volume(hu.astype(np.float32), volume.ras_from_ijk)
-
-
-def _first(
-    fixed: Volume,
-    moving: Volume,
-    lung: Mask,
-    settings: FfdSettings,
-    seen: Mask | None,
-    prior: PointMap | None,
-    progress: Callable[[str, float], None] | None,
-) -> PointMap | None:
-    """Map found on coarser voxels by the whole lung or by its depth; the prior where nothing lies so deep.
-
-    Both are found up to twice the finest spacing, and the one under which the depth looks more alike goes on to it.
-    """
-    settings = replace(settings, voxel_mm=1.5 * settings.voxel_mm)
-    fixed, moving = coarsen(fixed, settings.voxel_mm), coarsen(moving, settings.voxel_mm)
-    inside = coarsen_mask(lung, settings.voxel_mm).hu >= 0.5
-    shown = np.ones_like(inside) if seen is None else coarsen_mask(seen, settings.voxel_mm).hu >= 0.5
-    # Where the scanner's view ends there is no wall, so the depth counts from what it shows outside the lung.
-    bare = near(~inside & shown, DEEP_MM, fixed.grid.spacing)
-    whole, deep = (Mask(region & shown, fixed.ras_from_ijk) for region in (inside, inside & ~bare))
-    if not deep.inside.any():
-        return prior
-    levels = max(settings.levels - 1, 1)
-    coarse = replace(settings, spacing_mm=2 * settings.spacing_mm, levels=levels, steps=COARSE_STEPS)
-    samples = Pyramid(fixed, deep, moving, None, settings.voxel_mm).at(settings.voxel_mm)
-    found = []
-    for region in (whole, deep):
-        fit = register_ffd(fixed, moving, coarse, fixed_mask=region, prior=prior, progress=progress).moving_from_fixed
-        found.append((_unlikeness(samples, fit, settings), region, fit.field.refined()))
-    _, region, start = min(found, key=lambda candidate: candidate[0])
-    fine = replace(settings, levels=1)
-    return register_ffd(
-        fixed, moving, fine, fixed_mask=region, prior=prior, start=start, progress=progress
-    ).moving_from_fixed
-
-
-def _unlikeness(images: Images, found: PointMap, settings: FfdSettings) -> float:
-    """Dissimilarity of the samples under a map."""
-    m = interpolate(images.moving.hu, images.moving.grid, found(images.samples.points()), OUTSIDE_HU)
-    weights = np.ones(len(m), dtype=np.float32)
-    return chosen_metric(images, settings).evaluate(m, weights).value
 
 
 def _carried(
