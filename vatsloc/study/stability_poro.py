@@ -1,32 +1,30 @@
-"""Where the poroelastic lung stops being right: pressure bounds, inverted elements, nu towards 0.5, contact, hilum."""
+"""Where the poroelastic lung stops being right: pressure bounds, inverted elements, hilum, and the studies beside."""
 
 from __future__ import annotations
 
 import csv
+import inspect
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from scipy.sparse import bsr_matrix
 
 from poro.assembly import deformation_gradient
 from poro.choice import finite_problem
 from poro.finite import deform
 from poro.flow import Flow
 from poro.laws import neo_hookean
-from poro.model import PoroSystem, Theta, solve, without_wall
-from poro.solid import solid
-from poro.tissue import GRAVITY_KPA_PER_MM, Tissue
-from vatsloc.study.poro_lung import lung, smooth_wall, system_of
-from vatsloc.study.tables import Row, markdown
+from poro.mesh.tetmesh import Array
+from poro.model import Theta, solve, without_wall
+from poro.tissue import Tissue
+from vatsloc.study.poro_lung import HILUM_CENTRE, Lung, lung, smooth_wall, system_of
+from vatsloc.study.stability_poro_contact import contact_meshes, contact_methods
+from vatsloc.study.stability_poro_mesh import slivers, towards_incompressible
+from vatsloc.study.stability_poro_page import page
+from vatsloc.study.tables import Row
 
 TETS = 3_000
 _TISSUE = Tissue()
-
-
-def _system(tets: int = TETS, tissue: Tissue = _TISSUE, hilum_radius_mm: float = 22.0) -> PoroSystem:
-    return system_of(lung(tets, hilum_radius_mm), tissue, smooth_wall())
 
 
 def pressure_bounds() -> list[Row]:
@@ -46,7 +44,7 @@ def pressure_bounds() -> list[Row]:
 
 def inverted_elements() -> list[Row]:
     """Smallest det F and inverted share over (kappa_b, phi), linear against neo-Hookean."""
-    system, rows, law = _system(), [], neo_hookean(_TISSUE)
+    system, rows, law = system_of(lung(TETS), _TISSUE, smooth_wall()), [], neo_hookean(_TISSUE)
     for kappa_b in (1e-9, 1e-8, 1e-6):
         for phi in (0.3, 0.6, 0.9):
             theta = Theta(kappa_b, phi)
@@ -69,93 +67,42 @@ def inverted_elements() -> list[Row]:
     return rows
 
 
-def towards_incompressible() -> list[Row]:
-    """Mean motion under weight alone, without wall, as nu goes to 0.5, on two meshes."""
-    rows = []
-    for poisson in (0.35, 0.45, 0.49, 0.499, 0.4999):
-        row: Row = {"poisson": poisson}
-        for tets in (3_000, 24_000):
-            u = without_wall(_system(tets, Tissue(poisson=poisson)), Theta(0.0, 0.7))[1]
-            row[f"mean_mm_{tets}"] = float(np.linalg.norm(u, axis=1).mean())
+def small_hila(tets: int = 8_000) -> list[Row]:
+    """How the lung fares, without wall, gently and strongly collapsed within it, as the hilum that holds it shrinks."""
+    rows, gentle, strong = [], Theta(1e-9, 0.6), Theta(1e-6, 0.3)
+    body = lung(tets, hilum_radius_mm=40.0)
+    boundary = body.mesh.boundary
+    near = np.linalg.norm(boundary.points - HILUM_CENTRE, axis=1)
+    whole = len(body.hilum)
+    for count in (whole, *(fewer for fewer in (40, 20, 10, 5, 4, 3, 2) if fewer < whole)):
+        held = boundary.nodes[np.argsort(near)[:count]]
+        row: Row = {"hilum_nodes": count, "hilum_radius_mm": float(np.sort(near)[count - 1])}
         rows.append(row)
+        try:
+            system = system_of(Lung(body.mesh, held, np.zeros((count, 3))), _TISSUE, smooth_wall())
+        except ValueError as refusal:
+            row |= dict.fromkeys(_HELD, "-") | {"status": f"refused: {refusal}"}
+            continue
+        hung = without_wall(system, gentle)[1]
+        det = np.linalg.det(deformation_gradient(system.mesh, hung))
+        row |= {"hung_mean_mm": _mean(hung), "hung_min_det": float(det.min())}
+        row |= {"hung_inverted_percent": 100 * float((det <= 0).mean())}
+        states = {name: solve(system, theta) for name, theta in (("gentle", gentle), ("strong", strong))}
+        for name, state in states.items():
+            row |= {f"{name}_mean_mm": _mean(state.u), f"{name}_min_det": float(state.det_f.min())}
+        row |= {"strong_inverted_percent": 100 * states["strong"].inverted_share}
+        row |= {"status": ", ".join(state.status.name for state in states.values())}
     return rows
 
 
-def contact_methods(sizes: tuple[int, ...] = (1_500, TETS)) -> list[Row]:
-    """Penetration and iterations of penalty contact over its stiffness, beside the active set, on two meshes."""
-    rows, theta = [], Theta(1e-8, 0.8, 5.0)
-    for tets in sizes:
-        system = _system(tets)
-        exact = solve(system, theta)
-        gap = float(exact.gap[system.contact_nodes].min())
-        rows.append(_contact_row(tets, "active set", gap, exact.iterations, exact.contact.pivots, 0.0))
-        for stiffness in (0.1, 1.0, 10.0, 1000.0):
-            u, steps, deepest = _penalty(system, theta, stiffness)
-            away = float(np.linalg.norm(u - exact.u) / np.linalg.norm(exact.u))
-            rows.append(_contact_row(tets, f"penalty {stiffness:g} kPa/mm", deepest, steps, steps, away))
-    return rows
+_HELD = (
+    *("hung_mean_mm", "hung_min_det", "hung_inverted_percent"),
+    *("gentle_mean_mm", "gentle_min_det", "strong_mean_mm", "strong_min_det", "strong_inverted_percent"),
+)
 
 
-def _contact_row(tets: int, method: str, gap: float, steps: int, solves: int, away: float) -> Row:
-    return {
-        "tets": tets,
-        "method": method,
-        "deepest_mm": max(0.0, -gap),
-        "iterations": steps,
-        "set_changes": solves,
-        "rel_diff": away,
-    }
-
-
-def _penalty(system: PoroSystem, theta: Theta, stiffness: float, most: int = 40) -> tuple[Any, int, float]:
-    """Displacements, iterations (`most` when it cycles) and smallest gap under springs of stiffness kPa/mm."""
-    mesh, nodes, obstacle = system.mesh, system.contact_nodes, system.obstacle
-    p, _ = system.flow.pressure(theta.kappa_b)
-    load = (system.pressure_load @ p).reshape(-1, 3)
-    load = load + mesh.node_volumes[:, None] * system.gravity * GRAVITY_KPA_PER_MM * system.tissue.density(theta.phi)
-    area = np.zeros(len(mesh.points))
-    area[mesh.boundary.nodes] = mesh.boundary.node_areas
-    u, count = np.zeros_like(load), np.arange(len(load))
-    steps = 0
-    while steps < most:
-        steps += 1
-        gap, gradient, hessian = obstacle.gap(u[nodes], theta.d_diaph_mm)
-        pressing = np.where(gap < 0, stiffness * area[nodes], 0.0)
-        blocks, pull = np.zeros((len(u), 3, 3)), load.copy()
-        blocks[nodes] = pressing[:, None, None] * gradient[:, :, None] * gradient[:, None]
-        bend = (pressing * np.minimum(gap, 0))[:, None, None] * hessian
-        blocks[nodes] += bend
-        pull[nodes] += np.einsum("nij,nj->ni", bend, u[nodes])
-        along = np.einsum("nd,nd->n", gradient, u[nodes]) - gap
-        pull[nodes] += (pressing * along)[:, None] * gradient
-        springs = bsr_matrix((blocks, count, np.append(count, len(u)))).tocsr()
-        ahead = solid(mesh, system.tissue, system.hilum, springs).solve(pull, system.hilum_displacement)
-        moved = float(np.abs(ahead - u).max())
-        u = u + min(1.0, 20 / max(moved, 1e-30)) * (ahead - u)
-        if moved < 1e-3:
-            break
-    return u, steps, float(obstacle.gap(u[nodes], theta.d_diaph_mm)[0].min())
-
-
-def small_hila() -> list[Row]:
-    """How far the lung sags and how its worst element fares as the hilum that holds it shrinks."""
-    rows = []
-    for radius in (40.0, 30.0, 22.0, 18.0):
-        system = _system(8_000, hilum_radius_mm=radius)
-        state = solve(system, Theta(1e-9, 0.6))
-        free = without_wall(system, Theta(1e-9, 0.6))[1]
-        rows.append(
-            {
-                "hilum_radius_mm": radius,
-                "hilum_nodes": len(system.hilum),
-                "mean_mm_without_wall": float(np.linalg.norm(free, axis=1).mean()),
-                "mean_mm": float(np.linalg.norm(state.u, axis=1).mean()),
-                "min_det": float(state.det_f.min()),
-                "iterations": state.iterations,
-                "status": state.status.name,
-            }
-        )
-    return rows
+def _mean(u: Array) -> float:
+    return float(np.linalg.norm(u, axis=1).mean())
 
 
 STUDIES: dict[str, Callable[[], list[Row]]] = {
@@ -163,6 +110,8 @@ STUDIES: dict[str, Callable[[], list[Row]]] = {
     "inverted_elements": inverted_elements,
     "towards_incompressible": towards_incompressible,
     "contact_methods": contact_methods,
+    "contact_meshes": contact_meshes,
+    "slivers": slivers,
     "small_hila": small_hila,
 }
 
@@ -170,7 +119,7 @@ STUDIES: dict[str, Callable[[], list[Row]]] = {
 def stability_poro(out: Path, say: Callable[[str], None]) -> dict[str, list[Row]]:
     """Run every study, write a CSV and a plot of each and tables.md into `out`; returns the rows."""
     out.mkdir(parents=True, exist_ok=True)
-    result, pages = {}, []
+    result = {}
     for name, study in STUDIES.items():
         say(f"{name} ...")
         rows = result[name] = study()
@@ -178,8 +127,8 @@ def stability_poro(out: Path, say: Callable[[str], None]) -> dict[str, list[Row]
             writer = csv.DictWriter(file, list(rows[0]))
             writer.writeheader()
             writer.writerows(rows)
-        pages.append(f"## {name}\n{(study.__doc__ or '').strip()}\n\n{markdown(rows)}\n")
-    (out / "tables.md").write_text("\n".join(pages))
+    claims = {name: inspect.cleandoc(study.__doc__ or "") for name, study in STUDIES.items()}
+    (out / "tables.md").write_text(page(result, claims))
     plot(result, out)
     return result
 
@@ -187,8 +136,10 @@ def stability_poro(out: Path, say: Callable[[str], None]) -> dict[str, list[Row]
 PLOTS = {
     "pressure_bounds": ("kappa_b", ("min_pa_lumped", "min_pa_consistent")),
     "inverted_elements": ("kappa_b", ("linear_min_det", "finite_min_det")),
-    "towards_incompressible": ("poisson", ("mean_mm_3000", "mean_mm_24000")),
-    "small_hila": ("hilum_radius_mm", ("mean_mm_without_wall", "mean_mm")),
+    "towards_incompressible": ("poisson", ("rel_error_3000", "rel_error_24000")),
+    "contact_meshes": ("tets", ("off_finest_mm", "penalty_off_mm")),
+    "slivers": ("min_dihedral", ("factor_off_mm", "multigrid_iterations")),
+    "small_hila": ("hilum_nodes", ("gentle_min_det", "strong_min_det")),
 }
 
 
@@ -202,8 +153,9 @@ def plot(result: dict[str, list[Row]], out: Path) -> None:
     for name, (x, ys) in PLOTS.items():
         figure, axes = pyplot.subplots(figsize=(6, 4))
         for y in ys:
-            axes.plot([row[x] for row in result[name]], [row[y] for row in result[name]], "o", label=y)
-        axes.set(xlabel=x, title=name, xscale="log" if x == "kappa_b" else "linear")
+            known = [row for row in result[name] if row[y] != "-"]
+            axes.plot([row[x] for row in known], [row[y] for row in known], "o", label=y)
+        axes.set(xlabel=x, title=name, xscale="linear" if x == "poisson" else "log")
         axes.legend()
         figure.savefig(out / f"{name}.png", dpi=100)
         pyplot.close(figure)

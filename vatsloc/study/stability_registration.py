@@ -23,7 +23,7 @@ from registration.sliding import register_sliding
 from registration.spine import register_spine
 from registration.volume import Array, Grid, Mask, Volume
 from vatsloc.study import chart_variants
-from vatsloc.study.stability_poro import markdown
+from vatsloc.study.tables import markdown
 from vatsloc.workflow.pose import Register
 
 Row = dict[str, Any]
