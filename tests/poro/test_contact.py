@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -21,7 +23,9 @@ from poro.contact import (
 )
 from poro.curvature import Springs, group_springs
 from poro.levelset import LevelSet, level_set
+from poro.mesh import closest_points
 from poro.mesh.tetmesh import Array, TetMesh
+from poro.model import Theta, assemble, solve
 from poro.solid import Solid, solid
 from poro.tissue import GRAVITY_KPA_PER_MM, Tissue
 
@@ -224,3 +228,22 @@ def test_sensitivity_of_contact_equals_finite_differences(hollow: tuple) -> None
         total = [s.gradient * s.force[:, None] for s in (ahead, behind)]
         difference = (total[0] - total[1]) / (2 * (load or travel))
         assert_allclose(change[:, :, k], difference, atol=2e-4 * np.abs(difference).max())
+
+
+def test_nodes_that_the_diaphragm_lets_behind_the_cage_are_counted_and_the_hilum_is_left_out() -> None:
+    """A diaphragm that sinks under a heavy lung takes its nodes along, out of the cage."""
+    mesh = ellipsoid(15.0)
+    held = np.flatnonzero(np.linalg.norm(mesh.points - [-30, 0, 0], axis=1) < 16)
+    system = assemble(mesh, Tissue(), np.array([0, 0, -1.0]), held, np.zeros((len(held), 3)))
+    sinking = replace(system, obstacle=replace(system.obstacle, axis=-system.obstacle.axis))
+    assert not np.isin(system.contact_nodes, held).any()
+    for travel in (0.0, 8.0):
+        state = solve(sinking, Theta(0.0, 0.5, travel))
+        out = closest_points(mesh.boundary, (mesh.points + state.u)[system.contact_nodes]).distance
+        assert (out[~system.obstacle.moving] < 1.5).all()
+        assert state.gap.min() > -1e-3
+        if travel:
+            assert (out[system.obstacle.moving] > 2).sum() <= state.conflicts <= (out > 0).sum()
+            assert state.conflicts > 5
+        else:
+            assert state.conflicts == 0
