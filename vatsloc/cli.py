@@ -206,6 +206,25 @@ def chart(
     print(out / "chart.html")
 
 
+@app.command()
+def paper(
+    folders: Annotated[
+        list[Path], typer.Argument(metavar="DIR...", help="Case folders with landmarks, or folders that hold them.")
+    ],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for errors and tables; a rerun goes on.")],
+    jobs: Annotated[int, typer.Option(metavar="N", min=1, help="Cases run at once.")] = 1,
+) -> None:
+    """The experiments of Alvarez 2021 on cases with truth: variants A to C, diaphragm, parameters (extra "report")."""
+    from vatsloc.study.chart_draw import require_matplotlib
+    from vatsloc.study.cohort import find_cases
+    from vatsloc.study.paper import run_paper
+    from vatsloc.study.paper_draw import write_paper
+
+    require_matplotlib()
+    write_paper(run_paper(find_cases(folders), out, jobs, say), out)
+    print(out / "paper.md")
+
+
 @bench.command("poro")
 def bench_poro_command(
     cost: Annotated[bool, typer.Option("--cost", help="Also seconds and memory of every stage against mesh size.")] = (

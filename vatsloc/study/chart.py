@@ -19,8 +19,8 @@ from vatsloc.errors import InputRefused, NotConverged, VatslocError
 from vatsloc.evaluation.inputs import Truth, read_truth
 from vatsloc.evaluation.statistics import summarize
 from vatsloc.evaluation.tre import RunMaps, target_registration_errors
-from vatsloc.maps import MeshMap
 from vatsloc.study.chart_variants import Scored, Variant
+from vatsloc.study.scored import run_maps
 from vatsloc.workflow.pneumothorax import pneumothorax
 from vatsloc.workflow.pose import ChangeOfPose, change_of_pose
 from vatsloc.workflow.prepare import Prepared, prepare
@@ -158,16 +158,7 @@ def _run(runs: _CaseRuns, variant: Variant, row: Row) -> Row:
     collapse = pneumothorax(runs.case, runs.prepared, pose, variant.settings, stages)
     if collapse.fit.status is FitStatus.CONTACT:
         raise NotConverged("the contact of the collapsing lung did not settle")
-    def_from_inf = collapse.def_from_inf_rigid
-    after = collapse.mesh_after.points
-    maps = RunMaps(
-        rigid_inf_from_ct=rigid,
-        rigid_def_from_ct=def_from_inf @ rigid,
-        rigid_def_from_inf=def_from_inf,
-        inf_from_ct=pose.inf_from_ct,
-        def_from_inf=MeshMap(pose.mesh_inf, after, def_from_inf),
-        def_from_ct=MeshMap(pose.mesh_ct, after, def_from_inf @ rigid),
-    )
+    maps = run_maps(pose, collapse)
     nodule = maps.def_from_inf(pose.inf_from_ct(runs.case.nodule.centre_ras[None]))
     row = _spent(replace(row, nodule_mm=_off(nodule, runs.truth)), phase1, _Cost.of(stages))
     return _scored(runs.truth, maps, row, PHASES)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Mapping
+from functools import reduce
 from pathlib import Path
 from typing import Any, Literal
 
@@ -128,9 +129,9 @@ def load_settings(preset: str, file: Path | None) -> Settings:
     return _checked(values, str(file))
 
 
-def settings_of(preset: str, over: Mapping[str, Any]) -> Settings:
-    """Values of a preset, overridden by those of tables in memory. Raises CaseError as `load_settings`."""
-    return _checked(_merged(_preset(preset), over), "settings")
+def settings_of(preset: str, *over: Mapping[str, Any]) -> Settings:
+    """Values of a preset, overridden by tables in memory, the last first. Raises CaseError as `load_settings`."""
+    return _checked(reduce(_merged, over, _preset(preset)), "settings")
 
 
 def _preset(name: str) -> dict[str, Any]:

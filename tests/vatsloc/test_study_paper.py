@@ -1,0 +1,69 @@
+"""The paper's experiments: settings of the variants, what is kept of a run, tables and tests by value."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vatsloc.study import paper
+from vatsloc.study.paper import CaseRuns, Run, read_runs, run_paper, settings_for
+from vatsloc.study.paper_draw import page
+
+
+def runs(case: str = "one") -> CaseRuns:
+    """C halves the errors of B, and B those of A; the diaphragm changes nothing; the paper's C has no answer."""
+    errors = np.linspace(4.0, 8.0, 9)
+    theta = (2e-8, 0.5, 12.0)
+    found = [Run("", name, tuple(4 * errors)) for name in paper.BEFORE]
+    found += [
+        Run("vatsloc", name, tuple(scale * errors), 1.25, theta)
+        for name, scale in (("A", 2.0), ("B", 1.0), ("C", 0.5), (paper.STILL, 0.5))
+    ]
+    found.append(Run("paper's model", "C", failed="the contact did not settle"))
+    return CaseRuns(case, tuple(found))
+
+
+def test_variants_switch_off_what_the_paper_leaves_out() -> None:
+    a, b, c = (settings_for(v, "vatsloc") for v in ("A", "B", "C"))
+    assert not a.registration.on
+    assert b.registration.on
+    assert not a.model.hilum
+    assert not b.model.hilum
+    assert c.model.hilum
+    still = settings_for(paper.STILL, "paper's model")
+    assert not still.model.diaphragm
+    assert still.model.cost == "plain"
+    assert not still.keypoints.on
+    assert not still.residual.on
+
+
+def test_the_page_holds_means_tests_and_parameters() -> None:
+    lines = {line.split(" | ")[0]: line for line in page([runs()]).splitlines()}
+    errors = next(line for line in page([runs()]).splitlines() if line.startswith("| one"))
+    assert "24.00 ± 5.48" in errors
+    assert "12.00 ± 2.74 | 6.00 ± 1.37 | 3.00 ± 0.68 | 3.00 ± 0.68 | 1.25 |" in errors
+    assert "- one, paper's model, C: the contact did not settle" in lines
+    tests = [line for line in page([runs()]).splitlines() if line.startswith("| one")]
+    # Nine pairs that all fall: two-sided exact p = 2 / 2**9.
+    assert tests[2] == "| one | 3.9e-03 (C) | 3.9e-03 (B) | 3.9e-03 (C) | 1.0e+00 (C, diaphragm still) |"
+    assert tests[3].endswith("| 2e-08 | 0.5 | 12 |")
+
+
+def test_what_was_run_is_kept_and_read_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    kept = runs("kept")
+    (tmp_path / "kept.json").write_text(json.dumps(asdict(kept)), encoding="utf-8")
+    monkeypatch.setattr(paper, "measure_case", lambda folder: pytest.fail(f"{folder} is run again"))
+    (tmp_path / "cases" / "kept").mkdir(parents=True)
+    assert run_paper([tmp_path / "cases" / "kept"], tmp_path) == [kept]
+
+
+def test_landmarks_without_truth_stay_unknown(tmp_path: Path) -> None:
+    case = CaseRuns("x", (Run("vatsloc", "C", (1.0, None)),))
+    (tmp_path / "x.json").write_text(json.dumps(asdict(case)), encoding="utf-8")
+    found = read_runs(tmp_path / "x.json").run("vatsloc", "C")
+    assert found is not None
+    np.testing.assert_array_equal(found.errors, [1.0, np.nan])
