@@ -122,12 +122,20 @@ def _cage(build: Build, x: Array, y: Array, z: Array) -> Array:
 
 
 def _body(build: Build, x: Array, y: Array, z: Array) -> Array:
-    shoulder = smoothstep(z, 10, 110)
-    half_x = build.width + 26 + build.fat[1] - 3 * smoothstep(z, -60, -150) + 10 * shoulder
-    half_y = build.depth + 33 + 0.7 * build.fat[0] - 12 * shoulder
-    centre = -10 + 0.3 * build.fat[0] - 0.06 * z
-    back = 5 * np.exp(-((x / 10) ** 2)) * (y < -0.7 * build.depth)
-    return _superellipse(x, y - centre, half_x, half_y, 2.5) + back
+    """Skin: flat behind with a furrow over the spine, widest at the shoulder blades, narrower and rounder in front."""
+    _, half_y, centre = cage_axes(build, np.minimum(z, 0.6 * build.apex))
+    armpit, shoulder = smoothstep(z, -70, 60), smoothstep(z, 45, 95)
+    front_y = centre + half_y + 14 + build.fat[0] + 14 * shoulder
+    back_y = np.maximum(spine_y(build, z) - 70 - 0.15 * build.fat[0], -build.depth - 54)
+    middle = 0.35 * front_y + 0.65 * back_y
+    ahead = y > middle
+    tapering = (10 + 12 * armpit) * (1 - shoulder) * smoothstep(y, -10, 0.9 * build.depth)
+    half_x = build.width + 19 + build.fat[1] + 17 * armpit - tapering
+    half_y = np.where(ahead, front_y - middle, middle - back_y)
+    power = np.where(ahead, 2.3 + 1.1 * shoulder, 2.7)
+    rho = ((np.abs(x) / half_x) ** power + (np.abs(y - middle) / half_y) ** power) ** (1 / power)
+    furrow = 2 * np.exp(-((x / 12) ** 2)) * smoothstep(middle - y, 0, 40)
+    return (rho - 1) * build.depth + furrow
 
 
 def _heart(build: Build, x: Array, y: Array, z: Array) -> Array:

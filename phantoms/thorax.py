@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from phantoms.anatomy import Build, Shapes, draw_build, make_shapes, spine_y
-from phantoms.fields import Lattice, coverage, smooth_noise, smoothstep
+from phantoms.fields import Lattice, coverage, smooth_noise
 from phantoms.lobes import Fissures, Lobes, Sheet, cut, whole
 from phantoms.nodule import Nodule
 from phantoms.patient import Patient
 from phantoms.skeleton import Vertebra, draw_bones, draw_spine
+from phantoms.soft_tissue import image_soft_tissue
 from phantoms.spec import Lesion
 from phantoms.trees import LungTrees, Tree, draw_tubes, grow, tubes
 from registration.volume import Grid
@@ -119,7 +120,7 @@ def image_body(thorax: Thorax, grid: Grid, open_lungs: tuple[str, ...]) -> Array
     rng = np.random.default_rng([thorax.seed, 2])
     s = thorax.shapes
     width = float(grid.spacing.mean())
-    hu = _soft_tissue(thorax, grid, width, rng)
+    hu = image_soft_tissue(s, grid, width, rng)
     draw_bones(hu, grid, s.build, thorax.spine, rng)
     for side in open_lungs:
         lung = s.lung(side).on(grid)
@@ -147,43 +148,6 @@ def draw_airways(hu: Array, grid: Grid, ends: Array, radii: Array, width: float)
     draw_tubes(lumen, grid, ends, radii, width)
     hu += wall * (WALL_HU - hu)
     hu += lumen * (AIR_HU - hu)
-
-
-def _soft_tissue(thorax: Thorax, grid: Grid, width: float, rng: np.random.Generator) -> Array:
-    s, b = thorax.shapes, thorax.build
-    x, y, z = s.body.axes
-    fibres = smooth_noise(s.body, 5.0, rng)
-    patches = smooth_noise(s.body, 9.0, rng)
-    fat = b.fat[1] + (b.fat[0] - b.fat[1]) * smoothstep(y, -20, 60) + 1.5 * patches
-    plane = np.abs(s.body.values + fat + 10 + 4 * patches) - 1.5
-    wall = 52 - 150 * np.maximum(smoothstep(fibres, 1.1, 1.7), smoothstep(-plane, -1.5, 1.0)) + 6 * patches
-    outside = wall + smoothstep(s.body.values + fat, -1.5, 1.5) * (-102 + 5 * patches - wall)
-    middle = 15 - 95 * smoothstep(patches + 0.02 * y, -0.4, 1.0)
-    belly = _belly(thorax, x, y, z, patches)
-    below = smoothstep(-s.below_diaphragm.values, -1.5, 1.5)
-    inside = middle + below * (belly - middle)
-    rind = smoothstep(s.heart.values, -6, -2) * smoothstep(patches, -0.6, 0.8)
-    inside = inside + smoothstep(-s.heart.values, -1.5, 1.5) * (38 + 3 * patches - 118 * rind - inside)
-    field = inside + smoothstep(s.cage.values, -1.5, 1.5) * (outside - inside)
-    hu = s.body.like(field).on(grid)
-    skin = s.body.on(grid)
-    hu += coverage(-skin - 2.0, width) * (15 - hu)
-    hu += (1 - coverage(skin, width)) * (-1000 - hu)
-    return hu
-
-
-def _belly(thorax: Thorax, x: Array, y: Array, z: Array, patches: Array) -> Array:
-    b = thorax.build
-    fat = -98 + 4 * patches
-    top = b.dome[1]
-    liver = smoothstep(x + 0.35 * (y - 20) - 0.25 * (z - top), -38, -30)
-    spleen = 1 - np.sqrt(((x + 88) / 36) ** 2 + ((y + 42) / 45) ** 2 + ((z - top + 42) / 46) ** 2)
-    stomach = 1 - np.sqrt(((x + 58) / 40) ** 2 + ((y - 28) / 38) ** 2 + ((z - top + 44) / 38) ** 2)
-    gas = smoothstep(stomach, 0.08, 0.14) * smoothstep(y, 38, 41)
-    hu = fat + liver * (58 + 4 * patches - fat)
-    hu = hu + smoothstep(spleen, 0, 0.05) * (50 - hu)
-    hu = hu + smoothstep(stomach, 0, 0.05) * (28 - hu)
-    return hu + gas * (-985 - hu)
 
 
 def _draw_great_tubes(hu: Array, thorax: Thorax, grid: Grid, width: float) -> None:

@@ -14,6 +14,7 @@ from phantoms.cbct import scanner_grid
 from phantoms.imaging import State, image_state
 from phantoms.lobes import Fissures
 from phantoms.measures import fissure_jump, lobe_overlap
+from phantoms.thorax import ct_grid, draw_thorax, image_body
 from registration.volume import Volume, axis_codes
 
 COARSE = PhantomSpec("coarse", "left", ct_spacing=(4.0, 4.0, 4.0), cbct_spacing=(4.0, 4.0, 4.0), element=28.0)
@@ -177,6 +178,18 @@ def test_tissues_have_their_densities(demo: PhantomCase) -> None:
     inside[np.hypot(i, j) > 110] = False
     assert np.median(demo.cbct_deflated.hu[gas & inside]) < -960
     assert np.percentile(demo.cbct_deflated.hu[deflated], 5) > -900
+
+
+@pytest.mark.parametrize("habitus", ["average", "obese"])
+def test_bones_lie_under_the_skin_and_the_skin_inside_the_image(habitus: str) -> None:
+    for seed in range(2):
+        person = draw_thorax("right", habitus, SPECS["demo"].lesion, seed)
+        grid = ct_grid(person, (4.0, 4.0, 4.0))
+        depth = -person.shapes.body.on(grid)
+        bone = image_body(person, grid, ("right", "left")) > 250
+        assert bone.sum() > 5_000
+        assert depth[bone].min() > -1.0
+        assert max(depth[[0, -1]].max(), depth[:, [0, -1]].max()) < 0
 
 
 def test_headers_agree_within_what_a_case_may_ask(demo: PhantomCase) -> None:
