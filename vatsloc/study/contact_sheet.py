@@ -40,7 +40,7 @@ def write_sheet(cases: Sequence[Path], out: Path, columns: int = 2, beside: Path
     strips = [np.pad(s, ((0, 0), (0, width - s.shape[1]))) for s in strips]
     strips += [np.zeros_like(strips[0])] * (-len(strips) % columns)
     rows = [np.hstack(strips[n : n + columns]) for n in range(0, len(strips), columns)]
-    if not cv2.imwrite(str(out), np.vstack(rows), [cv2.IMWRITE_JPEG_QUALITY, 45]):
+    if not cv2.imwrite(str(out), np.vstack(rows), [cv2.IMWRITE_JPEG_QUALITY, 42]):
         raise CaseError(f"{out} cannot be written; check that its folder exists.")
 
 
