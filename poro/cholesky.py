@@ -13,6 +13,8 @@ from scipy.sparse import csr_matrix
 from poro.dissection import Front, Tree
 from poro.mesh.tetmesh import Array
 
+STRIP = 512  # rows of an inverse that are added at a time, to keep what is in between small
+
 
 @dataclass(frozen=True)
 class Cholesky:
@@ -73,13 +75,17 @@ class Cholesky:
                 x[np.searchsorted(rows, self._borders[child]), column - start : column - start + update.shape[1]] += (
                     update
                 )
-                spread[child] = (column, update[:0])
+                spread[child] = (column, np.empty((0, 0), dtype))
             w: Array = inverse.astype(dtype, copy=False) @ x[:own]
-            result[start:last, start:last] += w.T @ w
+            for top in range(start, last, STRIP):
+                end = min(top + STRIP, last)
+                result[top:end, start:end] += w[:, top - start : end - start].T @ w[:, : end - start]
             spread.append((start, x[own:] - below.astype(dtype, copy=False) @ w))
         back = np.empty_like(rank)
         back[rank] = np.arange(len(rank))
-        return result[np.ix_(back, back)]
+        _mirror(result)
+        _reorder(result, back)
+        return result
 
     @cached_property
     def _order(self) -> Array:
@@ -154,3 +160,35 @@ def _add_lower(dense: Array, update: Array, place: Array) -> None:
 
 def _unknowns(nodes: Array, block: int) -> Array:
     return (np.asarray(nodes)[:, None] * block + np.arange(block)).ravel()
+
+
+@njit(cache=True)
+def _mirror(matrix: Array) -> None:
+    """Copy the lower triangle of a square matrix onto the upper one, by tiles, which stay in the cache."""
+    tile = 64
+    for top in range(0, len(matrix), tile):
+        for left in range(0, top + tile, tile):
+            for i in range(top, min(top + tile, len(matrix))):
+                for j in range(left, min(left + tile, i)):
+                    matrix[j, i] = matrix[i, j]
+
+
+@njit(cache=True)
+def _reorder(matrix: Array, source: Array) -> None:
+    """matrix[source][:, source] in place of a square matrix."""
+    row = np.empty_like(matrix[0])
+    for i in range(len(matrix)):
+        row[:] = matrix[i]
+        for j in range(len(row)):
+            matrix[i, j] = row[source[j]]
+    moved = np.zeros(len(matrix), np.bool_)
+    for first in range(len(matrix)):
+        if not moved[first]:
+            row[:] = matrix[first]
+            i = first
+            while source[i] != first:
+                matrix[i] = matrix[source[i]]
+                moved[i] = True
+                i = source[i]
+            matrix[i] = row
+            moved[i] = True
