@@ -21,16 +21,15 @@ from poro.modes import hilum_modes, shape_modes
 from poro.observations import Target
 from poro.tissue import Tissue
 from registration.matching import MatchSettings, Pairs, match_keypoints
-from registration.resample import coarsen, resample, resample_mask
-from registration.volume import Array, Mask
+from registration.volume import Array
 from vatsloc.imaging.surface import Border, SurfacePoints
-from vatsloc.maps import MeshMap, covered, sampled
+from vatsloc.maps import MeshMap
 from vatsloc.workflow.observe import Observed
 from vatsloc.workflow.prepare import Prepared
 from vatsloc.workflow.settings import KeypointSettings, Settings
 from vatsloc.workflow.stages import Stages
+from vatsloc.workflow.view import view_of
 
-PRIOR_SPACING_MM = 3.0
 BLOCK_MM = 40.0
 """Keypoints are held back by blocks this wide: neighbours tell nearly the same."""
 LEAST_PAIRS = 40
@@ -154,24 +153,18 @@ def inner_pairs(prepared: Prepared, observed: Observed, displacement: Array, set
 
     `first` is where they lie before the collapse, placed by the spine.
     """
-    rest = observed.model_mesh
-    moved = TetMesh(rest.points + displacement, rest.tets)
-    rigid = observed.def_from_inf_rigid
-    voxel = settings.voxel_mm
-    deflated, inflated = (coarsen(image.volume, voxel) for image in (prepared.deflated, prepared.inflated))
-    grid = deflated.grid
-    inf_from_def = MeshMap(moved, rigid.inverse()(rest.points), rigid.inverse())
-    prior = sampled(inf_from_def, grid.with_spacing(PRIOR_SPACING_MM))
-    seen = resample_mask(prepared.deflated.field.usable, grid).inside
-    both = resample_mask(prepared.inflated.field.usable, grid, prior).inside & seen
+    rest, rigid = observed.model_mesh, observed.def_from_inf_rigid
+    before = TetMesh(rigid.inverse()(rest.points), rest.tets)
+    model = MeshMap(before, rest.points + displacement, rigid)
+    view = view_of(prepared, observed.found.lung, model, settings.voxel_mm)
     pairs = match_keypoints(
-        resample(inflated, grid, prior),
-        deflated,
-        Mask(resample_mask(observed.found.lung, grid).inside & both, grid.ras_from_ijk),
-        MatchSettings(voxel_mm=voxel, reach_mm=settings.reach_mm),
-        first_region=Mask(covered(moved, grid).inside & both, grid.ras_from_ijk),
+        view.warped,
+        view.deflated,
+        view.lung,
+        MatchSettings(voxel_mm=settings.voxel_mm, reach_mm=settings.reach_mm),
+        first_region=view.modelled,
     )
-    return Pairs(rigid(inf_from_def(pairs.first)), pairs.second, pairs.ncc)
+    return Pairs(rigid(model.inverse()(pairs.first)), pairs.second, pairs.ncc)
 
 
 def held_back(points: Array) -> Array:

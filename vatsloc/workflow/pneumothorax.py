@@ -84,8 +84,7 @@ def collapse(
         chosen = chosen.model_copy(update={"levels": max(chosen.levels - 1, 1)})
     with stages.stage("residual registration"):
         residual = residual_registration(
-            prepared.inflated,
-            prepared.deflated,
+            prepared,
             observed.found.lung,
             MeshMap(pose.mesh_inf, after, rigid),
             before,

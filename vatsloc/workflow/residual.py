@@ -7,6 +7,7 @@ collapsed lung. Two registrations, there and back, tell where the answer can be 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from scipy import ndimage
@@ -19,15 +20,14 @@ from registration.ffd import FfdSettings, Weights, register_ffd
 from registration.inversion import invert_at
 from registration.matching import Pairs
 from registration.penalties import Keypoints
-from registration.resample import resample, resample_mask
 from registration.volume import Array, Mask
-from vatsloc.imaging.cbct import PreparedCbct
 from vatsloc.imaging.lattice import dilate, erode
 from vatsloc.imaging.surface import Border, SurfacePoints
-from vatsloc.maps import MeshMap, covered, sampled
+from vatsloc.maps import MeshMap
+from vatsloc.workflow.prepare import Prepared
 from vatsloc.workflow.settings import ResidualSettings
+from vatsloc.workflow.view import view_of
 
-PRIOR_SPACING_MM = 3.0
 BORDER_MM = 2.0
 NEAR_REGION_MM = 4.0
 LEAST_NODES = 30
@@ -61,8 +61,7 @@ class Residual:
 
 
 def residual_registration(
-    inflated: PreparedCbct,
-    deflated: PreparedCbct,
+    prepared: Prepared,
     lung_def: Mask,
     def_from_inf: MeshMap,
     mesh_before: TetMesh,
@@ -77,14 +76,10 @@ def residual_registration(
     places found again inside the lung, in the frames of the inflated and the deflated CBCT, which hold both
     registrations where they show.
     """
-    grid = deflated.volume.grid
     nodes = def_from_inf.moved
     modelled = TetMesh(nodes, def_from_inf.mesh.tets)
-    prior = sampled(def_from_inf.inverse(), grid.with_spacing(PRIOR_SPACING_MM))
-    warped = resample(inflated.volume, grid, prior)
-    both_see = resample_mask(inflated.field.usable, grid, prior).inside & deflated.field.usable.inside
-    observed = _region(resample_mask(lung_def, grid).inside & both_see, deflated)
-    expected = _region(covered(modelled, grid).inside & both_see, deflated)
+    view = view_of(prepared, lung_def, def_from_inf, settings.voxel_mm)
+    observed, expected = _inner(view.lung), _inner(view.modelled)
     if not (observed.inside.any() and expected.inside.any()):
         return None
     ffd = FfdSettings(
@@ -98,9 +93,9 @@ def residual_registration(
         Keypoints(one, other, weights) if len(pairs) else None
         for one, other in ((pairs.second, expected_at), (expected_at, pairs.second))
     )
-    seen_by_both = Mask(both_see, grid.ras_from_ijk)
-    there = register_ffd(deflated.volume, warped, ffd, fixed_mask=observed, moving_mask=seen_by_both, keypoints=forth)
-    back = register_ffd(warped, deflated.volume, ffd, fixed_mask=expected, moving_mask=seen_by_both, keypoints=homeward)
+    register = partial(register_ffd, settings=ffd, moving_mask=view.both_see)
+    there = register(view.deflated, view.warped, fixed_mask=observed, keypoints=forth)
+    back = register(view.warped, view.deflated, fixed_mask=expected, keypoints=homeward)
     inverse = invert_at(there.moving_from_fixed, nodes, nodes)
     placed, other = inverse.points_fixed, back.moving_from_fixed(nodes)
     disagreement = np.linalg.norm(placed - other, axis=1)
@@ -140,10 +135,9 @@ def _border_offsets(lung: TetMesh, surface: SurfacePoints, free: Array) -> tuple
     return border.nodes[chosen], mean[chosen, None] * border.node_normals[chosen]
 
 
-def _region(inside: Array, deflated: PreparedCbct) -> Mask:
+def _inner(lung: Mask) -> Mask:
     """Where lungs are compared: a little inside their border, which air and wall blur."""
-    grid = deflated.volume.grid
-    return Mask(erode(inside, BORDER_MM, grid.spacing), grid.ras_from_ijk)
+    return Mask(erode(lung.inside, BORDER_MM, lung.grid.spacing), lung.ras_from_ijk)
 
 
 def _near(region: Mask, points_ras: Array) -> Array:
