@@ -76,3 +76,11 @@ class Flow:
     def resolved(self, kappa_b: float) -> float:
         """Layer thickness over mean element height: below 1 the layer is carried by a single row of elements."""
         return self.tissue.layer_mm(kappa_b) / float(np.cbrt(self.mesh.volumes.mean() * 6 * np.sqrt(2)))
+
+    def layer(self, kappa_b: float) -> str:
+        """How the layer compares with the elements, as a sentence that says when the mesh is too coarse for it."""
+        spans, thick = self.resolved(kappa_b), self.tissue.layer_mm(kappa_b)
+        if spans >= 1:
+            return f"The pressure layer, {thick:.1f} mm, spans {spans:.1f} elements."
+        coarse = f"is thinner than an element, {spans:.2f} of it: the mesh is too coarse."
+        return f"The pressure layer, {thick:.1f} mm, {coarse}"

@@ -93,3 +93,7 @@ def test_unresolved_layers_are_told() -> None:
     flow = Flow(ellipsoid(9.0), TISSUE)
     assert flow.resolved(1e-9) > 2
     assert flow.resolved(1e-5) < 0.2
+    assert flow.resolved(1e-7) == pytest.approx(flow.resolved(1e-9) / 10)
+    assert flow.layer(1e-9) == f"The pressure layer, 38.8 mm, spans {flow.resolved(1e-9):.1f} elements."
+    assert flow.layer(1e-5).startswith("The pressure layer, 0.4 mm, is thinner than an element, 0.0")
+    assert flow.layer(1e-5).endswith("the mesh is too coarse.")

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 from poro.mesh import TetMesh
+from poro.tissue import Tissue
 from registration.rigid import RigidTransform
 from vatsloc.case import read_case
 from vatsloc.evaluation import evaluate_case
@@ -73,6 +74,8 @@ def test_run_holds_the_agreed_keys(run: dict[str, Any]) -> None:
     assert agreed | {"warnings"} <= set(run)
     assert set(run["theta"]) == {"kappa_b", "phi", "d_diaph_mm"}
     assert all(set(gate) >= {"ok", "value", "limit"} for gate in run["gates"].values())
+    layer = f"The pressure layer, {Tissue().layer_mm(run['theta']['kappa_b']):.1f} mm, "
+    assert run["residuals"]["fit"]["pressure_layer"].startswith(layer)
     stages = {name: seconds for name, seconds in run["seconds"].items() if name != "total"}
     assert run["seconds"]["total"] >= 0.9 * sum(stages.values())
     longest_first = run["nodule_ellipsoid95_mm"]

@@ -201,6 +201,7 @@ def _residuals(found: Localization) -> dict[str, Any]:
             "steps": len(collapse.fit.history),
             "model_surface_rms_mm": collapse.fit.surface_rms_mm,
             "contact_iterations": state.iterations,
+            "pressure_layer": collapse.system.flow.layer(collapse.fit.theta.kappa_b),
             "active_nodes": int(state.active.sum()),
             "min_det": state.det_f.min(),
             "volume_ratio": collapse.mesh_after.volumes.sum() / collapse.mesh_before.volumes.sum(),
