@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
 from poro.choice import keep_in_range
-from poro.fit import Fit, fit
+from poro.fit import Fit, FitSettings, fit
 from poro.laws import neo_hookean
 from poro.mesh import TetMesh, stuff
-from poro.model import assemble
+from poro.model import Theta, assemble, solve
 from poro.observations import Target
 from poro.tissue import Tissue
 from registration.matching import Pairs
-from vatsloc.workflow.ladder import Model, Step, best_of, corrected, held_back, misfit
-from vatsloc.workflow.localize import place_sigma_mm
+from vatsloc.workflow.ladder import NO_OTHERS, Model, Step, best_of, corrected, held_back, misfit
+from vatsloc.workflow.localize import place_sigma_mm, scatter
+from vatsloc.workflow.spread import other_answers
 
 GRADIENT = np.array([[-0.1, 0.02, 0.0], [0.03, -0.05, 0.04], [0.0, -0.02, 0.08]])
 
@@ -50,7 +52,7 @@ def still(lung: TetMesh) -> Model:
     found: Fit = fit(system, Target(boundary.points, boundary.node_normals, np.ones(len(boundary.points))))
     nothing = np.zeros_like(lung.points)
     solid = keep_in_range(system, found.state, neo_hookean(Tissue()))
-    return Model(system, replace(found, state=replace(found.state, u=nothing)), nothing, _pairs(), (), solid)
+    return Model(system, replace(found, state=replace(found.state, u=nothing)), nothing, _pairs(), (), solid, NO_OTHERS)
 
 
 def _pairs(noise_mm: float = 0.0, smooth: bool = True) -> Pairs:
@@ -123,3 +125,30 @@ def test_noise_alone_is_not_worth_a_rung(still: Model) -> None:
 def test_the_farther_from_a_place_found_again_the_less_sure() -> None:
     assert place_sigma_mm(0.0) == place_sigma_mm(8.0) == pytest.approx(0.7)
     assert place_sigma_mm(28.0) == pytest.approx(0.7 + 0.17 * 20)
+
+
+def test_other_answers_follow_the_inputs_and_agree_where_the_surface_tells_all(lung: TetMesh, still: Model) -> None:
+    system = still.system
+    truth = solve(system, Theta(2e-8, 0.7, 0.0))
+    boundary = lung.boundary.moved(lung.boundary.points + truth.u[lung.boundary.nodes])
+    seen = Target(boundary.points, boundary.node_normals, np.ones(len(boundary.points)))
+    settings = FitSettings(free=(True, True, False))
+    best = fit(system, seen, settings)
+    others = other_answers(system, seen, best, settings)
+    at_hilum = np.linalg.norm(others[:, system.hilum].mean(axis=1), axis=1)
+    moved = others[np.abs(at_hilum - 3) < 1e-6]
+    assert len(moved) == 3
+    assert_allclose(np.abs(moved[:, system.hilum].mean(axis=1)), 3 * np.eye(3), atol=1e-6)
+    held = others[at_hilum < 1e-6]
+    assert len(held) >= 4
+    # Starts and halves of a surface that the model explains end where the best fit did; only the two tilts differ.
+    assert sorted(np.linalg.norm(held, axis=2).max(axis=1) > 0.5) == [False] * (len(held) - 2) + [True] * 2
+
+
+def test_scatter_is_the_second_moment_of_the_other_answers(lung: TetMesh, still: Model) -> None:
+    others = np.zeros((2, len(lung.points), 3))
+    others[0, :, 0], others[1, :, 1] = 2.0, 4.0
+    model = replace(still, others=others)
+    collapse = SimpleNamespace(model=model, system=model.system)
+    assert_allclose(scatter(collapse, np.zeros(3)), np.diag([2.0, 8.0, 0.0]), atol=1e-9)
+    assert_allclose(scatter(SimpleNamespace(model=still, system=still.system), np.zeros(3)), np.zeros((3, 3)))

@@ -71,7 +71,7 @@ def test_disturbances_do_what_they_are_called(monkeypatch: pytest.MonkeyPatch) -
 
     surface, observed = _scene()
     nothing: Any = None
-    scene = Scene(nothing, nothing, nothing, nothing, observed)
+    scene = Scene(nothing, nothing, nothing, nothing, nothing, observed)
     rng = np.random.default_rng(0)
     noisy = DISTURBANCES["surface noise 5 mm"](scene, rng).observed.surface
     off = np.einsum("nd,nd->n", noisy.points - surface.points, surface.normals)

@@ -36,8 +36,9 @@ NAMES = ("log10 kappa_b", "phi", "d_diaph mm")
 
 @dataclass(frozen=True)
 class Scene:
-    """A case up to its observations, and its truth."""
+    """A case up to its observations, its truth, and the settings it is run with."""
 
+    settings: Settings
     case: Case
     truth: Truth
     prepared: Prepared
@@ -56,7 +57,7 @@ def stability_fit(cases: Sequence[Path], out: Path, settings: Settings, say: Say
         out.mkdir(parents=True, exist_ok=True)
         name = folder.resolve().name
         for what, disturb in DISTURBANCES.items():
-            row = {"case": name, "disturbed": what} | disturbed(scene, disturb, settings)
+            row = {"case": name, "disturbed": what} | disturbed(scene, disturb)
             tables["disturbed"].append(row)
             say(f"{name}: {what}: {row['landmarks_mm']} mm, {row['flagged'] or 'not flagged'}")
         system, target = _problem(scene)
@@ -68,13 +69,13 @@ def stability_fit(cases: Sequence[Path], out: Path, settings: Settings, say: Say
         (out / "tables.md").write_text(page(tables), encoding="utf-8")
 
 
-def disturbed(scene: Scene, disturb: Disturb, settings: Settings) -> Row:
+def disturbed(scene: Scene, disturb: Disturb) -> Row:
     """Errors in mm of a run on disturbed observations, its failed gates, and whether it failed without a word."""
     try:
         wrong = disturb(scene, np.random.default_rng(0))
         stages = Stages()
-        found = collapse(wrong.case, wrong.prepared, wrong.pose, wrong.observed, settings, stages)
-        answer = conclude(wrong.case, wrong.prepared, wrong.pose, found, settings, stages)
+        found = collapse(wrong.case, wrong.prepared, wrong.pose, wrong.observed, scene.settings, stages)
+        answer = conclude(wrong.case, wrong.prepared, wrong.pose, found, scene.settings, stages)
     except VatslocError as error:
         return {"landmarks_mm": "", "nodule_mm": "", "flagged": type(error).__name__, "silent": False}
     known, nodule = scene.truth.landmarks, scene.truth.nodule.nodule_deflated_ras
@@ -160,7 +161,7 @@ def _scene(folder: Path, settings: Settings) -> Scene:
     case, stages = read_case(folder), Stages()
     prepared = prepare(case, stages)
     pose = change_of_pose(case, prepared, settings, stages)
-    return Scene(case, read_truth(folder), prepared, pose, observe(case, prepared, pose, settings, stages))
+    return Scene(settings, case, read_truth(folder), prepared, pose, observe(case, prepared, pose, settings, stages))
 
 
 def _problem(scene: Scene) -> tuple[PoroSystem, Target]:
@@ -224,7 +225,7 @@ def _slipped_spine(scene: Scene, _rng: np.random.Generator) -> Scene:
     rigid = scene.observed.rigid
     slip = RigidTransform.about(np.zeros(3), np.zeros(3), np.array([0.0, 0.0, VERTEBRA_MM]))
     wrong = replace(rigid, moving_from_fixed=slip @ rigid.moving_from_fixed)
-    seen = observe(scene.case, scene.prepared, scene.pose, Settings(), Stages(), wrong)
+    seen = observe(scene.case, scene.prepared, scene.pose, scene.settings, Stages(), wrong)
     return replace(scene, observed=seen)
 
 

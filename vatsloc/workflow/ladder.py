@@ -27,6 +27,7 @@ from vatsloc.maps import MeshMap
 from vatsloc.workflow.observe import Observed
 from vatsloc.workflow.prepare import Prepared
 from vatsloc.workflow.settings import KeypointSettings, Settings
+from vatsloc.workflow.spread import other_answers
 from vatsloc.workflow.stages import Stages
 from vatsloc.workflow.view import view_of
 
@@ -56,7 +57,9 @@ class Model:
     """The collapse by mechanics. displacement: (n, 3) mm at the nodes of system.mesh, correction included.
 
     pairs: places found again, in the deflated CBCT's frame: `first` before the collapse (placed by the spine), `second`
-    after it; rungs: what was tried beyond the plain fit; solid: which strain measure the plain fit ended with, and why.
+    after it; rungs: what was tried beyond the plain fit; solid: which strain measure the plain fit ended with, and why;
+    others: (k, n, 3) mm, how far from `displacement` other answers lie: without any rung those of `other_answers`, with
+    one that of the model that has not seen all places.
     """
 
     system: PoroSystem
@@ -65,6 +68,7 @@ class Model:
     pairs: Pairs
     rungs: tuple[Rung, ...]
     solid: Chosen
+    others: Array
 
     @property
     def held_back_mm(self) -> float | None:
@@ -86,21 +90,31 @@ def climb(gravity: Array, prepared: Prepared, observed: Observed, settings: Sett
     with stages.stage("fit"):
         plain = fit(system, surface, fit_settings(settings))
         solid = keep_in_range(system, plain.state, neo_hookean(tissue))
-    plain = replace(plain, state=solid.state)
-    model = Model(system, plain, solid.state.u, NO_PAIRS, (), solid)
+    start = Model(system, replace(plain, state=solid.state), solid.state.u, NO_PAIRS, (), solid, NO_OTHERS)
+    model, blind = _rungs(start, surface, prepared, observed, settings, stages)
+    if any(rung.kept for rung in model.rungs):
+        return replace(model, others=(blind.displacement - model.displacement)[None])
+    with stages.stage("other answers"):
+        return replace(model, others=other_answers(system, surface, plain, fit_settings(settings)))
+
+
+def _rungs(
+    model: Model, surface: Target, prepared: Prepared, observed: Observed, settings: Settings, stages: Stages
+) -> tuple[Model, Model]:
+    """The model with what was kept beyond the plain fit, and the one that has not seen the places held back."""
     if not settings.keypoints.on:
         stages.skip("keypoints", "switched off in the settings")
-        return model
+        return model, model
     with stages.stage("keypoints"):
         model = replace(model, pairs=inner_pairs(prepared, observed, model.displacement, settings.keypoints))
-    why = _too_few(model.pairs)
+    blind, why = model, _too_few(model.pairs)
     if why:
         stages.skip("regional fit", why)
-        return model
-    blind = model
+        return model, model
     if settings.model.regional:
         with stages.stage("regional fit"):
-            model, blind = best_of({"regional fit": _regional(gravity, settings)}, model, blind, surface)
+            steps = {"regional fit": _regional(model.system.gravity, settings)}
+            model, blind = best_of(steps, model, blind, surface)
         if any(rung.kept for rung in model.rungs):
             with stages.stage("keypoints again"):
                 pairs = inner_pairs(prepared, observed, model.displacement, settings.keypoints)
@@ -108,8 +122,8 @@ def climb(gravity: Array, prepared: Prepared, observed: Observed, settings: Sett
     if settings.model.correct and not _too_few(model.pairs):
         with stages.stage("elastic correction"):
             steps = {f"elastic correction, strain {strain:g}": corrected(strain) for strain in CORRECTION_STRAINS}
-            model, _ = best_of(steps, model, blind, surface)
-    return model
+            model, blind = best_of(steps, model, blind, surface)
+    return model, blind
 
 
 def best_of(steps: dict[str, Step], model: Model, blind: Model, surface: Target) -> tuple[Model, Model]:
@@ -146,6 +160,7 @@ def _too_few(pairs: Pairs) -> str | None:
 
 
 NO_PAIRS = Pairs(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
+NO_OTHERS = np.zeros((0, 0, 3))
 
 
 def inner_pairs(prepared: Prepared, observed: Observed, displacement: Array, settings: KeypointSettings) -> Pairs:

@@ -104,7 +104,8 @@ def nodule_ellipsoid(
     """Semi-axes (3,) mm, longest first, and their directions (3, 3) in rows, that hold the nodule with 95 %.
 
     Where the images placed the tissue around the nodule, their registrations' errors and disagreement count; where they
-    did not, the fit's covariance. Either way it is no surer than the distance to the nearest place found again allows.
+    did not, the fit's covariance and the scatter of other answers. Either way it is no surer than the distance to the
+    nearest place found again allows.
     """
     point = collapse.def_from_inf_rigid(nodule_inf[None])[0]
     residual, pairs = collapse.residual, collapse.model.pairs
@@ -112,14 +113,28 @@ def nodule_ellipsoid(
     if collapse.model.rungs:
         least_mm = model_mm = place_sigma_mm(float(np.linalg.norm(pairs.second - nodule_def, axis=1).min()))
     lengths, directions = ellipsoid95(collapse.fit, collapse.system, point, model_mm)
+    covariance = (directions * (lengths**2 / CHI2_95_3D)) @ directions.T + scatter(collapse, point)
     if residual is None:
-        return lengths, directions.T
-    covariance = (directions * (lengths**2 / CHI2_95_3D)) @ directions.T
+        return _semi_axes(covariance)
     at = locate(pose.mesh_inf, nodule_inf[None])
     trust = float(interpolate(at, residual.seen.astype(float))[0])
     disagreement = float(interpolate(at, np.where(residual.seen, residual.disagreement_mm, 0.0))[0])
     known = max(2 * REGISTRATION_MM**2 + (disagreement / 2) ** 2, least_mm**2)
-    values, vectors = np.linalg.eigh(trust * known * np.eye(3) + (1 - trust) * covariance)
+    return _semi_axes(trust * known * np.eye(3) + (1 - trust) * covariance)
+
+
+def scatter(collapse: Collapse, point: Array) -> Array:
+    """Second moment (3, 3) mm2 of other answers about the one given, at a point (3,) before the collapse."""
+    others = collapse.model.others
+    if not len(others):
+        return np.zeros((3, 3))
+    at = locate(collapse.system.mesh, point[None])
+    off = np.array([interpolate(at, other)[0] for other in others])
+    return np.asarray(off.T @ off / len(off))
+
+
+def _semi_axes(covariance: Array) -> tuple[Array, Array]:
+    values, vectors = np.linalg.eigh(covariance)
     return np.sqrt(CHI2_95_3D * values[::-1]), vectors[:, ::-1].T
 
 

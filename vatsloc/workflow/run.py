@@ -24,7 +24,7 @@ from vatsloc.report.data import LUNG, SURFACE, Outline, Picture
 from vatsloc.report.render import write_report
 from vatsloc.results import OUTPUT_FILES, REPORT, SCENE, ResultData, RunRecord, write_results
 from vatsloc.scene import write_result_scene
-from vatsloc.workflow.localize import Localization, localize, surface_distances
+from vatsloc.workflow.localize import Localization, localize, scatter, surface_distances
 from vatsloc.workflow.pneumothorax import contact_surface
 from vatsloc.workflow.pose import ChangeOfPose
 from vatsloc.workflow.residual import Residual
@@ -207,11 +207,18 @@ def _residuals(found: Localization) -> dict[str, Any]:
             "volume_ratio": collapse.mesh_after.volumes.sum() / collapse.mesh_before.volumes.sum(),
         },
         "keypoints": {"found": len(collapse.model.pairs), "held_back_mm": collapse.model.held_back_mm},
+        "other_answers": {"number": len(collapse.model.others), "rms_mm_at_nodule": _scatter_mm(found)},
         "ladder": [asdict(rung) for rung in collapse.model.rungs],
         "residual_registration": _corrected(collapse.residual),
         "surface_mm": {f"p{share}": np.percentile(surface_distances(collapse), share) for share in (50, 75, 90, 95)},
         "mesh": {"tetrahedra": len(pose.mesh_ct.tets), "model_tetrahedra": len(collapse.system.mesh.tets)},
     }
+
+
+def _scatter_mm(found: Localization) -> float:
+    """Root mean square distance in mm between the nodule's place and those of other answers."""
+    point = found.collapse.def_from_inf_rigid(found.nodule_inf[None])[0]
+    return float(np.sqrt(np.trace(scatter(found.collapse, point))))
 
 
 def _spine(fit: RigidFit) -> dict[str, Any]:
