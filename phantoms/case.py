@@ -9,12 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from phantoms.cbct import expose, scanner_grid
+from phantoms.cbct import Scanner, expose, scanner_grid
 from phantoms.fields import coverage
 from phantoms.imaging import Picture, State, image_state
 from phantoms.measures import measure
 from phantoms.nodule import Nodule, nodule_mask, paint_nodule
 from phantoms.patient import Patient
+from phantoms.projection import expose_views, scene_grid
 from phantoms.spec import SPECS, PhantomSpec
 from phantoms.states import make_states
 from phantoms.thorax import Thorax, ct_grid, draw_lung_trees, draw_thorax, image_body
@@ -64,6 +65,8 @@ def make_case(spec: PhantomSpec | str, seed: int = 0) -> PhantomCase:
         spec = SPECS[spec]
     if spec.side not in ("right", "left"):
         raise ValueError(f"side must be 'right' or 'left', got {spec.side!r}")
+    if spec.scanner.domain not in ("image", "projection"):
+        raise ValueError(f"the scanner's domain must be 'image' or 'projection', got {spec.scanner.domain!r}")
     rng = np.random.default_rng([seed, 11])
     thorax = draw_thorax(spec.side, spec.habitus, spec.lesion, seed, spec.fused)
     patient = thorax.patient
@@ -88,7 +91,7 @@ def finish_case(
     grid = scanner_grid(view, spec.cbct_spacing, spec.scanner.length, spec.scanner.fov)
     grids = [_moved_grid(grid, s) for s in states]
     pictures = [image_state(patient, body, s, g) for s, g in zip(states, grids, strict=True)]
-    shots = [expose(p.clean, spec.scanner, rng) for p in pictures]
+    shots = [_shoot(patient, body, s, p, spec.scanner, rng) for s, p in zip(states, pictures, strict=True)]
     nodule = nodule_mask(patient.nodule, ct.grid)
     nodule_points = [_nodule_centre(patient.nodule, s) for s in states]
     ct_marks = _landmarks(places, states, grids, spec.scanner.fov, rng)
@@ -119,6 +122,16 @@ def finish_case(
         masks=_masks(ct_lung, pictures),
         info=measure(states, ct_marks, dense_ct, ends),
     )
+
+
+def _shoot(
+    patient: Patient, body: Volume, state: State, picture: Picture, scanner: Scanner, rng: np.random.Generator
+) -> Volume:
+    """Cone-beam CT of a state, in the domain that the scanner is simulated in."""
+    if scanner.domain == "image":
+        return expose(picture.clean, scanner, rng)
+    grid = picture.clean.grid
+    return expose_views(image_state(patient, body, state, scene_grid(grid)).clean, grid, scanner, rng)
 
 
 def _moved_grid(grid: Grid, state: State) -> Grid:

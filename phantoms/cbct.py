@@ -20,7 +20,8 @@ OUTSIDE_HU = -1000.0
 class Scanner:
     """Cone-beam scanner. fov: mm diameter; length: mm it shows along the patient; blur: mm standard deviation;
     cupping: share of the signal lost in the middle; rim: share gained at the edge of the field of view; noise: HU;
-    end: mm of bad slices at either end."""
+    end: mm of bad slices at either end; domain: "image" for artefacts of those sizes, "projection" for a C-arm of that
+    field of view and dose, which has its own."""
 
     fov: float = 240.0
     length: float = 170.0
@@ -29,6 +30,7 @@ class Scanner:
     rim: float = 0.10
     noise: float = 21.0
     end: float = 12.0
+    domain: str = "image"
 
 
 def scanner_grid(centre: Array, spacing: tuple[float, float, float], length_mm: float, fov_mm: float = 240.0) -> Grid:

@@ -133,6 +133,9 @@ def phantom(
     series: Annotated[
         int | None, typer.Option(metavar="N", min=10, max=100, help="Breathe the twin instead: N states of one breath.")
     ] = None,
+    cbct: Annotated[
+        str, typer.Option(metavar="DOMAIN", help='Scanner: image, or projection for a C-arm (extra "projections").')
+    ] = "image",
 ) -> None:
     """Write a synthetic case with known truth, the whole suite with a table of how hard its cases are, or the twin of a
     scan: collapsed, or breathing."""
@@ -143,18 +146,18 @@ def phantom(
 
     moving = side_named(side)
     if suite is not None and (name, out, from_ct) == (None, None, None):
-        made = write_suite(suite, jobs, say)
+        made = write_suite(suite, jobs, say, cbct)
         if sheet is not None:
             write_sheet([suite / case for case in made], sheet, beside=beside)
         print(table(made))
     elif suite is None and out is not None and from_ct is not None:
         if series is None:
-            write_twin(from_ct, moving, out, name, seed, nodule, say)
+            write_twin(from_ct, moving, out, name, seed, nodule, say, cbct)
         else:
             write_series(from_ct, moving, out, series, seed, say)
         print(out)
     elif suite is None and from_ct is None and name is not None and out is not None:
-        write_phantom(name, out, seed, say)
+        write_phantom(name, out, seed, say, cbct)
         print(out)
     else:
         raise CaseError(
@@ -297,6 +300,21 @@ def bench_registration_command(
     say(table(result))
     if out is not None:
         out.write_text(page(result), encoding="utf-8")
+    if as_json:
+        show(result)
+
+
+@bench.command("cbct")
+def bench_cbct_command(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the phantom.")] = "demo",
+    seed: Annotated[int, typer.Option(metavar="N", help="Seed of the anatomy.")] = 0,
+    as_json: JsonOption = False,
+) -> None:
+    """The phantoms' cone-beam scanner in the image domain beside a C-arm's projections (extra "projections")."""
+    from vatsloc.study.bench_cbct import bench_cbct, table
+
+    result = bench_cbct(name, seed, say)
+    say(table(result))
     if as_json:
         show(result)
 

@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import asdict, replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from phantoms.case import PhantomCase, make_case
+from phantoms.projection import MISSING
 from phantoms.spec import SPECS, PhantomSpec
 from phantoms.twin import Scan, make_twin
 from registration.volume import Array
@@ -29,15 +31,26 @@ INFO_FILE = "truth/info.json"
 DENSE_HEADER = "ct_x,ct_y,ct_z,inf_x,inf_y,inf_z,def_x,def_y,def_z"
 
 
-def write_phantom(name: str, folder: Path, seed: int = 0, say: Say = quiet) -> None:
+def write_phantom(name: str, folder: Path, seed: int = 0, say: Say = quiet, cbct: str = "image") -> None:
     """Make the phantom called `name` and write it as a case folder, whole or not at all.
 
-    Raises CaseError for an unknown name, or where `folder` holds something else.
+    cbct: domain of the scanner, "image" or "projection". Raises CaseError for an unknown name or domain, where RTK is
+    missing that a domain needs, or where `folder` holds something else.
     """
     if name not in SPECS:
         raise CaseError(f'"{name}" is no phantom; choose one of {", ".join(SPECS)}.')
+    spec = scanned(SPECS[name], cbct)
     say(f"phantom {name}, seed {seed} ...")
-    _write_whole(lambda: make_case(name, seed), folder, recipe(name, seed), say)
+    _write_whole(lambda: make_case(spec, seed), folder, recipe(name, seed, cbct), say)
+
+
+def scanned(spec: PhantomSpec, cbct: str) -> PhantomSpec:
+    """The phantom with its scanner in a domain; raises CaseError for an unknown one, or where RTK is missing for it."""
+    if cbct not in ("image", "projection"):
+        raise CaseError(f'--cbct must be image or projection, got "{cbct}".')
+    if cbct == "projection" and find_spec("itk") is None:
+        raise CaseError(f"{MISSING}.")
+    return replace(spec, scanner=replace(spec.scanner, domain=cbct))
 
 
 def write_twin(
@@ -48,13 +61,15 @@ def write_twin(
     seed: int = 0,
     nodule: Path | None = None,
     say: Say = quiet,
+    cbct: str = "image",
 ) -> None:
     """Make the digital twin of one scan and write it as a case folder, whole or not at all.
 
     ct: image or DICOM folder; name: phantom whose collapse, lesion and scanner it gets; nodule: mask of the one it has,
-    else one is put in. Raises CaseError for an unknown name, InputRefused where the scan does not show what is needed.
+    else one is put in; cbct: as in `write_phantom`. Raises CaseError for an unknown name, InputRefused where the scan
+    does not show what is needed.
     """
-    spec = twin_spec(side, name)
+    spec = scanned(twin_spec(side, name), cbct)
     say(f"twin of {ct.name}, {side} lung, seed {seed} ...")
     scan = read_scan(ct, side, nodule)
     made_from = {"spec": json.loads(json.dumps(asdict(spec))), "seed": seed, "scan": ct.name}
@@ -102,9 +117,9 @@ def _write_whole(make: Callable[[], PhantomCase], folder: Path, made_from: dict[
     say(f"{made.spec.name} written to {folder}: {cost['seconds']:.0f} s, {cost['peak_mb']:.0f} MB")
 
 
-def recipe(name: str, seed: int) -> dict[str, Any]:
+def recipe(name: str, seed: int, cbct: str = "image") -> dict[str, Any]:
     """What a phantom is made from, as its truth/info.json says it."""
-    return {"spec": json.loads(json.dumps(asdict(SPECS[name]))), "seed": seed}
+    return {"spec": json.loads(json.dumps(asdict(scanned(SPECS[name], cbct)))), "seed": seed}
 
 
 def read_info(folder: Path) -> dict[str, Any] | None:

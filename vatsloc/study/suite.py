@@ -28,13 +28,13 @@ _COLUMNS = {
 }
 
 
-def write_suite(folder: Path, jobs: int = 1, say: Say = quiet) -> dict[str, dict[str, Any]]:
+def write_suite(folder: Path, jobs: int = 1, say: Say = quiet, cbct: str = "image") -> dict[str, dict[str, Any]]:
     """Make the cases of `SUITE` that `folder` lacks, `jobs` at once, each in a process of its own; truth/info.json of
-    all of them by name."""
-    missing = [name for name, seed in SUITE.items() if not _made(folder / name, name, seed)]
+    all of them by name. cbct: domain of the scanners."""
+    missing = [name for name, seed in SUITE.items() if not _made(folder / name, recipe(name, seed, cbct))]
     say(f"{len(SUITE) - len(missing)} of {len(SUITE)} cases are there, {len(missing)} to make")
     with ProcessPoolExecutor(jobs, get_context("spawn"), max_tasks_per_child=1) as pool:
-        running = {pool.submit(write_phantom, name, folder / name, SUITE[name]): name for name in missing}
+        running = {pool.submit(write_phantom, name, folder / name, SUITE[name], cbct=cbct): name for name in missing}
         for done in as_completed(running):
             done.result()
             say(f"{running[done]} written")
@@ -59,9 +59,9 @@ def table(suite: dict[str, dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
-def _made(folder: Path, name: str, seed: int) -> bool:
+def _made(folder: Path, made_from: dict[str, Any]) -> bool:
     info = read_info(folder)
-    return info is not None and all(info.get(key) == value for key, value in recipe(name, seed).items())
+    return info is not None and all(info.get(key) == value for key, value in made_from.items())
 
 
 def _two(pair: list[float]) -> str:
