@@ -61,10 +61,8 @@ class Compliance:
         return self._groups
 
     def between(self, nodes: Array, along: Array) -> Array:
-        """Motion (k, k) of contact nodes (k,) along directions (k, 3) under unit forces at them along these; of the
-        matrix's type.
-        """
-        return _between(self.matrix, nodes, along.astype(self.matrix.dtype))
+        """Motion (k, k) of contact nodes (k,) along directions (k, 3) under unit forces at them along these."""
+        return _between(self.matrix, nodes, along)
 
     def apply(self, force: Array) -> Array:
         """Displacements (nc, 3) of all contact nodes under forces (nc, 3), most of them zero."""
@@ -104,8 +102,8 @@ def _group_means(matrix: Array, label: Array, share: Array) -> Array:
 @njit(cache=True)
 def _between(matrix: Array, nodes: Array, along: Array) -> Array:
     count, last, tile = len(nodes), 0, 32
-    result = np.empty((count, count), matrix.dtype)
-    row = np.empty(matrix.shape[1], matrix.dtype)
+    result = np.empty((count, count))
+    row = np.empty(matrix.shape[1])
     for i in range(count):
         n = nodes[i]
         last = max(last, 3 * n + 3)

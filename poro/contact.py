@@ -140,9 +140,9 @@ class Linearized:
 
         Factored in the compliance's own precision and, where that is single, refined once.
         """
-        own = matrix.dtype
+        own = self.compliance.matrix.dtype
         (factorize,) = get_lapack_funcs(("potrf",), dtype=own)
-        upper, failed = factorize(matrix.T, clean=0)
+        upper, failed = factorize(matrix.T.astype(own, copy=False), clean=0)
         if failed:
             raise ValueError(f"contact nodes {failed - 1} and an earlier one move alike; the compliance is singular")
         half = solve_triangular(upper, coupling.astype(own, copy=False), trans=1, check_finite=False)
@@ -156,7 +156,7 @@ class Linearized:
 
         push, pull = forces(offset, self.slack)
         if own == np.float32:
-            left = offset + matrix @ push.astype(own) + coupling @ pull
+            left = offset + matrix @ push + coupling @ pull
             more, stronger = forces(left, self.slack + coupling.T @ push + self.springs.matrix @ pull)
             push, pull = push + more, pull + stronger
         return push, pull

@@ -9,7 +9,7 @@ from shapes import compliance_of, ellipsoid
 
 import poro.compliance
 from poro.assembly import body_load, stiffness
-from poro.contact import Obstacle, settle
+from poro.contact import ContactStatus, Obstacle, settle
 from poro.levelset import level_set
 from poro.solid import solid, unknowns_of
 from poro.solver import inverse_at, linear_solver
@@ -51,3 +51,6 @@ def test_contact_in_single_precision_moves_nodes_by_less_than_a_micron(monkeypat
     assert exact.active.sum() > 20
     assert (exact.active == single.active).all()
     assert 0 < np.abs(exact.u - single.u).max() < 1e-3
+    for state in states:
+        assert state.status is ContactStatus.SETTLED
+        assert_allclose(state.gap[state.active], 0, atol=1e-9)

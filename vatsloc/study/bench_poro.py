@@ -22,13 +22,13 @@ COMPARED_TETS = 28_000
 SWEEP = 50
 _MEASURED = 4  # values of the sweep that GetFEM really solves; the rest is extrapolated from their mean
 _TISSUE = Tissue()
-_BOUNDS = """What bounds our seconds. Cold: the factor and the compliance of the contact nodes, once per lung,
-dense products near the processor's peak (9 and 65 Gflop for 1708 nodes); the lung without wall alone takes about a
-twelfth of GetFEM's time with it, so no contact solver could make a cold start much more than ten times faster. Warm:
-five to seven Newton steps, whose number the wall's curvature sets (settling the active set within a step does not
-lower it), each a dense Cholesky factor of the nodes in contact and two passes over their compliance, 105 MB, as fast as
-memory allows. Exponents leave out the multigrid row. Contact needs the factor: beyond 6,000 contact nodes or with
-multigrid the table stops at the lung without wall."""
+_BOUNDS = """What bounds our seconds. Cold: the factor and the compliance of the contact nodes, once per lung, dense
+products near the processor's peak (9 and 65 Gflop for 1708 nodes). The lung without wall alone takes about a tenth of
+GetFEM's time with it, so that no contact solver could make a cold start much more than ten times faster. Warm: about
+five Newton steps a value, which neither settling the active set within a step nor finer springs for the wall's
+curvature make much fewer (4.8 at best, tried on this sweep), each a dense Cholesky factor of the nodes in contact and
+two passes over their compliance, 105 MB, as fast as memory allows. Exponents leave out the multigrid row. Contact
+needs the factor: beyond 6,000 contact nodes or with multigrid the table stops at the lung without wall."""
 
 
 def sweep_thetas(count: int = SWEEP) -> list[Theta]:
