@@ -12,7 +12,7 @@ LOBED = PhantomSpec(
     "right",
     ct_spacing=(3.0, 3.0, 3.0),
     cbct_spacing=(3.0, 3.0, 3.0),
-    element=20.0,
+    element=24.0,
     fused=0.25,
     collapse=Collapse(lobes_apart=0.1),
 )

@@ -63,10 +63,10 @@ def test_mass_of_the_lung_is_kept(case: PhantomCase) -> None:
     before = (patient.parenchyma.at(lung.points()[inside]) + 1000).sum() * lung.spacing**3
     for _, state, _ in _states(case):
         middle = state.posed(state.lung_map(state.samples)).mean(axis=0)
-        grid = scanner_grid(middle, (2.5, 2.5, 2.5), 340.0, 260.0)
+        grid = scanner_grid(middle, (3.0, 3.0, 3.0), 340.0, 260.0)
         body = Volume(np.full((4, 4, 4), -1000, dtype=np.float32), np.diag([1.0, 1, 1, 1]))
         hu = image_state(patient, body, state, grid).clean.hu
-        after = (hu[hu > -990] + 1000).sum() * 2.5**3
+        after = (hu[hu > -990] + 1000).sum() * 3.0**3
         assert after == pytest.approx(before, rel=0.01)
 
 
@@ -182,14 +182,13 @@ def test_tissues_have_their_densities(demo: PhantomCase) -> None:
 
 @pytest.mark.parametrize("habitus", ["average", "obese"])
 def test_bones_lie_under_the_skin_and_the_skin_inside_the_image(habitus: str) -> None:
-    for seed in range(2):
-        person = draw_thorax("right", habitus, SPECS["demo"].lesion, seed)
-        grid = ct_grid(person, (4.0, 4.0, 4.0))
-        skin = person.shapes.body
-        bone = image_body(person, grid, ("right", "left")) > 250
-        assert bone.sum() > 5_000
-        assert skin.on(grid)[bone].max() < 1.0
-        assert min(skin.values[[0, -1]].min(), skin.values[:, [0, -1]].min()) > 2.0
+    person = draw_thorax("right", habitus, SPECS["demo"].lesion, 0)
+    grid = ct_grid(person, (4.0, 4.0, 4.0))
+    skin = person.shapes.body
+    bone = image_body(person, grid, ("right", "left")) > 250
+    assert bone.sum() > 5_000
+    assert skin.on(grid)[bone].max() < 1.0
+    assert min(skin.values[[0, -1]].min(), skin.values[:, [0, -1]].min()) > 2.0
 
 
 def test_headers_agree_within_what_a_case_may_ask(demo: PhantomCase) -> None:

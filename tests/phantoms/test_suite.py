@@ -11,7 +11,6 @@ import pytest
 
 from phantoms import SPECS, SUITE, PhantomCase
 from phantoms.measures import affine_share
-from phantoms.spec import Collapse
 from phantoms.states import make_states
 from phantoms.thorax import draw_thorax
 from vatsloc.errors import CaseError
@@ -38,13 +37,13 @@ def test_stiff_even_tissue_on_a_loose_root_moves_almost_as_an_affine_map() -> No
     spec = replace(SPECS["stiff-lung"], element=28.0)
     person = draw_thorax(spec.side, spec.habitus, spec.lesion, SUITE["stiff-lung"]).patient
     shares = []
-    for collapse in (spec.collapse, replace(spec.collapse, stiffness=1.0, root=1.0), Collapse()):
+    for collapse in (spec.collapse, replace(spec.collapse, stiffness=1.0, root=1.0)):
         rng = np.random.default_rng(0)
         (inflated, deflated), _, _ = make_states(person, replace(spec, collapse=collapse), rng)
         tissue = inflated.samples
         shares.append(affine_share(inflated.lung_map(tissue), deflated.lung_map(tissue)))
     assert 0.10 < shares[0] < 0.14
-    assert shares[0] < shares[1] - 0.03 < shares[2] - 0.06
+    assert shares[0] < shares[1] - 0.03
 
 
 def test_a_case_that_is_there_is_kept_and_tabled(
