@@ -8,7 +8,7 @@ from vatsloc.study.tables import Row, markdown
 def page(result: dict[str, list[Row]], claims: dict[str, str]) -> str:
     """The study as a page of the documentation. claims: what each table shows, by name."""
     lines = ["# Where the poroelastic lung stops being right", ""]
-    lines += ["Made by `vatsloc stability poro --out DIR` (about two minutes), beside each table as CSV and the plots."]
+    lines += ["Made by `vatsloc stability poro --out DIR` (about a minute), beside each table as CSV and the plots."]
     lines += ["The lung is 1 l with a bay for the heart and a dome for the diaphragm, 3,000 tetrahedra unless a table"]
     lines += ["says otherwise."]
     lines += ["", "What the tables say:", "", *(f"- {sentence}" for sentence in findings(result))]
