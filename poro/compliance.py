@@ -87,16 +87,19 @@ def _bisect(points: Array, groups: int) -> Array:
 
 @njit(cache=True)
 def _group_means(matrix: Array, label: Array, share: Array) -> Array:
-    """Means (3 nc, 3 g) of the columns over the groups; of the rows (3 g, 3 nc), rather, the matrix being symmetric."""
-    sums = np.zeros((3 * len(share), matrix.shape[1]), matrix.dtype)
+    """Means (3 nc, 3 g) of the columns over the groups; of the rows, rather, the matrix being symmetric.
+
+    Summed in double precision: what rounding adds here looks like slack to the springs, which never comes to rest.
+    """
+    sums = np.zeros((3 * len(share), matrix.shape[1]))
     for n in range(len(label)):
         for axis in range(3):
             total, row = sums[3 * label[n] + axis], matrix[3 * n + axis]
             for c in range(len(row)):
                 total[c] += row[c]
     for g in range(len(share)):
-        sums[3 * g : 3 * g + 3] *= matrix.dtype.type(share[g])
-    return sums.T.copy()
+        sums[3 * g : 3 * g + 3] *= share[g]
+    return sums.T.astype(matrix.dtype)
 
 
 @njit(cache=True)

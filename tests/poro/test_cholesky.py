@@ -5,10 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from scipy.sparse import identity
 from shapes import compliance_of, ellipsoid
 
 import poro.compliance
 from poro.assembly import body_load, stiffness
+from poro.compliance import Compliance
 from poro.contact import ContactStatus, Obstacle, settle
 from poro.levelset import level_set
 from poro.solid import solid, unknowns_of
@@ -54,3 +56,21 @@ def test_contact_in_single_precision_moves_nodes_by_less_than_a_micron(monkeypat
     for state in states:
         assert state.status is ContactStatus.SETTLED
         assert_allclose(state.gap[state.active], 0, atol=1e-9)
+
+
+def test_means_over_groups_lose_nothing_to_single_precision(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rounding in them would pull at the springs of a solution at rest."""
+    monkeypatch.setattr(poro.compliance, "GROUPS", 4)
+    rng = np.random.default_rng(0)
+    matrix = rng.uniform(0.5, 1.5, (600, 600)).astype(np.float32)
+    matrix = np.tril(matrix) + np.tril(matrix, -1).T
+    monkeypatch.setattr(Compliance, "matrix", matrix)
+    solver = linear_solver(identity(600, format="csr"), rng.normal(size=(200, 3)))
+    groups = Compliance(solver, np.zeros((200, 3)), 600).groups(rng.normal(size=(200, 3)))
+    assert_allclose(1 / groups.share, 50)
+    columns = matrix.astype(float).reshape(200, 3, 200, 3)
+    exact = np.stack([columns[:, :, groups.label == g].mean(axis=2) for g in range(4)], axis=2)
+    assert groups.motion.dtype == np.float32
+    assert_allclose(groups.motion, exact, rtol=7e-8)
+    mean = np.stack([exact[groups.label == g].mean(axis=0) for g in range(4)])
+    assert_allclose(groups.mean, mean, rtol=7e-8)
