@@ -22,7 +22,7 @@ from vatsloc.evaluation.inputs import Truth, read_truth
 from vatsloc.evaluation.tre import target_registration_errors
 from vatsloc.formats.folder import write_whole
 from vatsloc.study.scored import run_maps
-from vatsloc.workflow.observe import observe
+from vatsloc.workflow.observe import Observed, observe
 from vatsloc.workflow.pneumothorax import collapse
 from vatsloc.workflow.pose import ChangeOfPose, change_of_pose
 from vatsloc.workflow.prepare import Prepared, prepare
@@ -106,23 +106,27 @@ def measure_case(folder: Path) -> CaseRuns:
     case, truth = read_case(folder), read_truth(folder)
     prepared = prepare(case, Stages())
     poses: dict[bool, ChangeOfPose] = {}
+    seen: dict[tuple[bool, bool], Observed] = {}
     runs: list[Run] = []
     for variant, over in VARIANTS.items():
         chosen = settings_of("balanced", over)
-        moves = chosen.registration.on
+        moves, hilum = chosen.registration.on, chosen.model.hilum
         try:
             if moves not in poses:
                 poses[moves] = change_of_pose(case, prepared, chosen, Stages())
-            runs += _collapses(case, truth, prepared, poses[moves], variant)
+            if (moves, hilum) not in seen:
+                seen[moves, hilum] = observe(case, prepared, poses[moves], chosen, Stages())
+            runs += _collapses(case, truth, prepared, poses[moves], seen[moves, hilum], variant)
         except VatslocError as error:
             runs += [Run(kind, variant, failed=str(error)) for kind in KINDS]
     return CaseRuns(folder.resolve().name, tuple(dict.fromkeys(runs)))
 
 
-def _collapses(case: Case, truth: Truth, prepared: Prepared, pose: ChangeOfPose, variant: str) -> list[Run]:
+def _collapses(
+    case: Case, truth: Truth, prepared: Prepared, pose: ChangeOfPose, observed: Observed, variant: str
+) -> list[Run]:
     """A variant in both kinds, and the poses before it if it is the complete one."""
     runs = []
-    observed = observe(case, prepared, pose, settings_for(variant, "vatsloc"), Stages())
     for kind in KINDS:
         found = collapse(case, prepared, pose, observed, settings_for(variant, kind), Stages())
         if found.fit.status is FitStatus.CONTACT:
