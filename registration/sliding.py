@@ -72,8 +72,8 @@ def register_sliding(
     )
     held = replace(settings.weights, keypoints=HOLD * settings.weights.keypoints)
     finest = replace(settings, levels=min(settings.levels, LAST_LEVELS), weights=held)
-    alike = (coarsen(image, settings.voxel_mm) for image in (fixed, moving))
-    found = partial(_found_again, *alike, inner, moving_lung, settings.voxel_mm)
+    voxel = settings.voxel_mm
+    found = partial(_found_again, coarsen(fixed, voxel), coarsen(moving, voxel), inner, moving_lung, voxel)
     register = partial(register_ffd, *images, fixed_mask=region, progress=progress)
     first = register(settings=coarse, prior=start, keypoints=found(start, FAR_MM)).moving_from_fixed
     return register(settings=finest, prior=first, keypoints=found(first, NEAR_MM))
