@@ -94,6 +94,21 @@ def test_scores_of_a_known_motion(person_folder: Path) -> None:
     assert f"{moved.mean():.2f}" in bench.table(result)
 
 
+def test_a_lung_on_its_back_empties_there() -> None:
+    points = np.column_stack([np.zeros(5), np.linspace(-80.0, 120.0, 5), np.full(5, 7.0)])
+    down = bench.emptied(points, 0.3)
+    assert_allclose(down[:, 1], -60 * np.array([0, 0.1875, 0.25, 0.1875, 0]))
+    assert_allclose(down[:, [0, 2]], 0)
+
+
+def test_dependent_emptying_turns_round_with_the_breath(person_folder: Path) -> None:
+    person = read_person(person_folder)
+    for deflate, sign in ((True, -1), (False, 1)):
+        motion = person.motions(deflate, bench.EDGE_MM)[0]
+        moved = bench.by_dependent_emptying(motion) - bench.by_sliding_elasticity(motion)
+        assert 3 < sign * np.median(moved[:, 1]) < 12
+
+
 def test_a_folder_that_lacks_a_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(CaseError, match=r"lacks lungs_inspiration.nii.gz and lungs_expiration.nii.gz and landmarks"):
         read_person(tmp_path)
