@@ -29,6 +29,8 @@ FAR_MM, NEAR_MM = 24.0, 8.0
 """How far along each axis places are looked for about the prior, and about the first map."""
 HOLD = 0.5
 """Share of their weight that places keep at the finest levels, where images are nearer than half a voxel."""
+ENOUGH = 300
+"""Fewer places hold less: the errors of each weigh more in their mean."""
 LEAST_PAIRS = 20
 """Fewer pairs than this may all be chance."""
 
@@ -70,13 +72,15 @@ def register_sliding(
         voxel_mm=1.5 * settings.voxel_mm,
         levels=max(settings.levels - 1, 1),
     )
-    held = replace(settings.weights, keypoints=HOLD * settings.weights.keypoints)
-    finest = replace(settings, levels=min(settings.levels, LAST_LEVELS), weights=held)
     voxel = settings.voxel_mm
     found = partial(_found_again, coarsen(fixed, voxel), coarsen(moving, voxel), inner, moving_lung, voxel)
     register = partial(register_ffd, *images, fixed_mask=region, progress=progress)
     first = register(settings=coarse, prior=start, keypoints=found(start, FAR_MM)).moving_from_fixed
-    return register(settings=finest, prior=first, keypoints=found(first, NEAR_MM))
+    holding = found(first, NEAR_MM)
+    share = 0.0 if holding is None else HOLD * min(len(holding.fixed) / ENOUGH, 1.0)
+    held = replace(settings.weights, keypoints=share * settings.weights.keypoints)
+    finest = replace(settings, levels=min(settings.levels, LAST_LEVELS), weights=held)
+    return register(settings=finest, prior=first, keypoints=holding)
 
 
 def _found_again(
