@@ -45,8 +45,7 @@ class FfdSettings:
     spacing_mm: finest control spacing; levels: each coarser one doubles it; voxel_mm: finest image voxels;
     window_mm: edge of the local correlation's window, None for one correlation over all samples;
     noise_hu: standard deviation below which a window counts as noise; mass_preserving: lung HU follows the volume;
-    weights: see `Weights`; steps: Gauss-Newton steps per level at most; tolerance: share of the objective that the last
-    step of a level may still gain; metric: another dissimilarity than these
+    weights: see `Weights`; steps: Gauss-Newton steps per level at most; metric: another dissimilarity than these
     correlations, made from the samples of a level.
     """
 
@@ -58,7 +57,6 @@ class FfdSettings:
     mass_preserving: bool = False
     weights: Weights = field(default_factory=Weights)
     steps: int = 30
-    tolerance: float = 1e-3
     metric: Callable[[Images], Metric] | None = None
 
 
@@ -162,8 +160,7 @@ def _level(setting: _Setting, images: Images, spline: BSplineField) -> tuple[BSp
     if setting.keypoints is not None:
         terms.append(Matches(control, setting.keypoints, prior, weights.keypoints))
     start = np.moveaxis(spline.coefficients, 3, 0)
-    settings = setting.settings
-    descent = gauss_newton(Objective(terms), start, settings.steps, settings.tolerance, refresh=image.refresh)
+    descent = gauss_newton(Objective(terms), start, setting.settings.steps, refresh=image.refresh)
     return BSplineField(np.moveaxis(descent.coefficients, 0, 3).astype(float), spline.ras_from_ijk), descent
 
 

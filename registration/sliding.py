@@ -27,8 +27,6 @@ AROUND_MM = 20.0
 """What is kept around the lungs: more than they grow by, and more than voxels are blurred by."""
 FAR_MM, NEAR_MM = 24.0, 8.0
 """How far along each axis places are looked for about the prior, and about the first map."""
-LEADING = 10.0
-"""How much sooner than the finest levels the coarse ones may stop: they only lead."""
 HOLD = 0.5
 """Share of their weight that places keep at the finest levels, where images are nearer than half a voxel."""
 ENOUGH = 300
@@ -73,7 +71,6 @@ def register_sliding(
         spacing_mm=2 * settings.spacing_mm,
         voxel_mm=1.5 * settings.voxel_mm,
         levels=max(settings.levels - 1, 1),
-        tolerance=LEADING * settings.tolerance,
     )
     voxel = settings.voxel_mm
     found = partial(_found_again, coarsen(fixed, voxel), coarsen(moving, voxel), inner, moving_lung, voxel)
