@@ -52,12 +52,12 @@ def draw(results: Sequence[CaseRuns], path: Path) -> None:
     matplotlib.use("agg")
     from matplotlib import pyplot
 
-    size = (2 + 1.3 * len(results), 11)
+    size = (max(2 + 1.3 * len(results), 12), 11)
     figure, grid = pyplot.subplots(len(FIGURES), len(KINDS), figsize=size, sharey="row", layout="constrained")
     for axes_row, (title, variants) in zip(grid, FIGURES.items(), strict=True):
         for axes, kind in zip(axes_row, KINDS, strict=True):
             _panel(axes, results, kind, variants)
-            axes.set_title(f"{kind}: {title}", fontsize=10)
+            axes.set_title(f"{kind}: {title}", fontsize=9)
     figure.savefig(path, dpi=70)
     pyplot.close(figure)
 
