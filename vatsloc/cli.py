@@ -304,6 +304,29 @@ def bench_registration_command(
         show(result)
 
 
+@bench.command("fit")
+def bench_fit_command(
+    cases: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            metavar="CASES", help="Case folders, folders of them, or NAME:SEED of a phantom; default: three phantoms."
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="DIR", help="Folder that keeps the results; a rerun goes on.")
+    ] = None,
+    jobs: Annotated[int, typer.Option(metavar="N", min=1, help="Cases run at once.")] = 1,
+    as_json: JsonOption = False,
+) -> None:
+    """The whole chain: errors, seconds, how often the ellipsoid holds the nodule, and the share of silent failures."""
+    from vatsloc.study.bench_fit import bench_fit, table
+
+    result = bench_fit(cases or [], out, jobs, say=say)
+    say(table(result))
+    if as_json:
+        show(result)
+
+
 @bench.command("cbct")
 def bench_cbct_command(
     name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the phantom.")] = "demo",

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from vatsloc.errors import CaseError
+from vatsloc.study import bench_fit as fits
 from vatsloc.study.cohort import Outcome, as_json, find_cases, run_cohort, summary, table
 
 PROGRAM = """
@@ -28,7 +29,9 @@ if command == "localize":
     out = Path(rest[1])
     out.mkdir(exist_ok=True)
     gates = {"view": {"ok": True}, "fissures": {"ok": name != "gated"}}
-    (out / "run.json").write_text(json.dumps({"gates": gates, "peak_mb": 123.0 + int(os.environ["NUMBA_NUM_THREADS"])}))
+    peak = 123.0 + int(os.environ["NUMBA_NUM_THREADS"])
+    seconds = {"total": 9.0, "fit": 2.0, "keypoints": 0.5, "warp": 4.0}
+    (out / "run.json").write_text(json.dumps({"gates": gates, "peak_mb": peak, "seconds": seconds}))
     if name == "gated":
         print("vatsloc: do not trust it", file=sys.stderr)
         sys.exit(5)
@@ -114,6 +117,36 @@ def test_coverage_and_silent_failures_are_shares_of_what_can_be_told() -> None:
     assert as_json(outcomes)["silent_failure_share"] == 0.5
     assert summary(outcomes).startswith("3 cases, 2 with exit code 0.")
     assert "| a / b |" in table(outcomes)
+
+
+def test_bench_fit_tells_errors_seconds_coverage_and_silent_failures(
+    cases: list[Path], program: tuple[str, ...], tmp_path: Path
+) -> None:
+    result = fits.bench_fit([tmp_path / "cases"], tmp_path / "out", jobs=3, program=program)
+    rows = {row["name"]: row for row in result["cases"]}
+    assert list(rows) == sorted(NAMES)
+    good = rows["good"] | {"seconds": None}
+    assert good == {
+        "name": "good",
+        "seconds": None,
+        "seconds_fit": 2.5,
+        "chain_mean": 1.0,
+        "nodule_mm": 0.5,
+        "in_ellipsoid95": True,
+        "exit_code": 0,
+    }
+    assert rows["good"]["seconds"] > 0
+    assert rows["refused"]["chain_mean"] is rows["refused"]["seconds_fit"] is None
+    assert result["silent_failure_share"] == pytest.approx(1 / 3)
+    assert result["coverage95"] == pytest.approx(1 / 3)
+    assert "| refused | " in fits.table(result)
+    assert "None" not in fits.table(result)
+    assert fits.table(result).endswith(
+        "Silent failures (nodule or mean landmark error over 10 mm under exit code 0): 1 of 3."
+    )
+    (tmp_path / "calls").unlink()
+    fits.bench_fit(cases[:1], tmp_path / "out", program=program)
+    assert not (tmp_path / "calls").exists()
 
 
 def test_cases_are_found_once_and_names_are_unique(cases: list[Path], tmp_path: Path) -> None:
