@@ -45,8 +45,8 @@ class FfdSettings:
     spacing_mm: finest control spacing; levels: each coarser one doubles it; voxel_mm: finest image voxels;
     window_mm: edge of the local correlation's window, None for one correlation over all samples;
     noise_hu: standard deviation below which a window counts as noise; mass_preserving: lung HU follows the volume;
-    weights: see `Weights`; steps: Gauss-Newton steps per level at most; metric: another dissimilarity than these
-    correlations, made from the samples of a level.
+    weights: see `Weights`; steps: Gauss-Newton steps per level at most; residual: relative one to which each is solved;
+    metric: another dissimilarity than these correlations, made from the samples of a level.
     """
 
     spacing_mm: float = 16.0
@@ -57,6 +57,7 @@ class FfdSettings:
     mass_preserving: bool = False
     weights: Weights = field(default_factory=Weights)
     steps: int = 30
+    residual: float = 0.1
     metric: Callable[[Images], Metric] | None = None
 
 
@@ -160,7 +161,8 @@ def _level(setting: _Setting, images: Images, spline: BSplineField) -> tuple[BSp
     if setting.keypoints is not None:
         terms.append(Matches(control, setting.keypoints, prior, weights.keypoints))
     start = np.moveaxis(spline.coefficients, 3, 0)
-    descent = gauss_newton(Objective(terms), start, setting.settings.steps, refresh=image.refresh)
+    settings = setting.settings
+    descent = gauss_newton(Objective(terms), start, settings.steps, residual=settings.residual, refresh=image.refresh)
     return BSplineField(np.moveaxis(descent.coefficients, 0, 3).astype(float), spline.ras_from_ijk), descent
 
 

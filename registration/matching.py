@@ -17,6 +17,10 @@ from registration.volume import Array, Mask, Volume
 
 FLAT_HU = 15.0
 """Standard deviation below which a block shows nothing but noise."""
+THIN_BLUR = 1.0
+"""Voxels by which images are blurred before every other voxel is left out."""
+CLIMBS = 4
+"""How many of the best shifts of the thinned blocks are looked at with whole ones."""
 
 
 @dataclass(frozen=True)
@@ -121,85 +125,164 @@ def _search(
     fixed: Volume, moving: Volume, starts: Array, believed: Array, radius: int, reach: int
 ) -> tuple[Array, Array]:
     """Voxels (n, 3), between voxels by a quadric, whose blocks look most like those at `starts`, and their NCC."""
-    if not len(starts):
+    n = len(starts)
+    best, around = np.zeros((n, 3), np.int64), np.full((n, 27), -1, np.float32)
+    if not n:
         return np.zeros((0, 3)), np.zeros(0)
-    scores = np.full((len(starts), *(3 * (2 * reach + 1,))), -1, np.float32)
-    _blocks(fixed.hu, moving.hu, np.ascontiguousarray(starts, np.int64), believed, radius, reach, FLAT_HU, scores)
-    best = scores.reshape(len(starts), -1).argmax(axis=1)
-    shift = np.stack(np.unravel_index(best, scores.shape[1:]), axis=1)
-    ncc = scores.reshape(len(starts), -1)[np.arange(len(starts)), best]
-    offset, is_top = _between(scores, shift)
-    return starts + shift - reach + offset, np.where(is_top, ncc, -1)
+    level = np.float32(moving.hu.mean(dtype=float))
+    f, m = fixed.hu - level, moving.hu - level
+    thin_f, thin_m = (ndimage.gaussian_filter(hu, THIN_BLUR) for hu in (f, m))
+    starts = np.ascontiguousarray(starts, np.int64)
+    _blocks(f, m, thin_f, thin_m, starts, believed, radius, reach, best, around)
+    offset, is_top = _between(around)
+    is_top &= (np.abs(best) < reach).all(axis=1)
+    return starts + best + offset, np.where(is_top, around[:, 13], -1)
 
 
-def _between(scores: Array, shift: Array) -> tuple[Array, Array]:
-    """Offset (n, 3) in voxels of the top of the quadric through the 27 scores about each highest one, and whether it is
-    a top: not on the border of the search or of the image.
+def _between(around: Array) -> tuple[Array, Array]:
+    """Offset (n, 3) in voxels of the top of the quadric through the 27 scores (n, 27) about each highest one, in C
+    order, and whether it is a top: not on the border of the search or of the image.
     """
     steps = np.array([(a, b, c) for a in (-1, 0, 1) for b in (-1, 0, 1) for c in (-1, 0, 1)])
     x, y, z = steps.T
     design = np.stack([np.ones(27), x, y, z, x * x / 2, y * y / 2, z * z / 2, x * y, x * z, y * z], axis=1)
-    inside = ((shift > 0) & (shift < scores.shape[1] - 1)).all(axis=1)
-    at = np.clip(shift[:, None] + steps, 0, scores.shape[1] - 1)
-    around = scores[np.arange(len(shift))[:, None], at[..., 0], at[..., 1], at[..., 2]].astype(float)
-    k = around @ np.linalg.pinv(design).T
+    k = around.astype(float) @ np.linalg.pinv(design).T
     hessian = np.stack([k[:, [4, 7, 8]], k[:, [7, 5, 9]], k[:, [8, 9, 6]]], axis=1)
-    known = inside & (around > -1).all(axis=1) & (np.linalg.eigvalsh(hessian)[:, -1] < -1e-6)
-    result = np.zeros(shift.shape)
+    known = (around > -1).all(axis=1) & (np.linalg.eigvalsh(hessian)[:, -1] < -1e-6)
+    result = np.zeros((len(around), 3))
     result[known] = -np.linalg.solve(hessian[known], k[known, 1:4, None])[..., 0]
     known &= np.abs(result).max(axis=1) <= 1
     return result, known
 
 
 @njit(cache=True, fastmath=True)
-def _correlation(block, ff, moving, believed, a, b, c, radius, flat):
-    """NCC of a centred block with the one about voxel (a, b, c); -1 where that cannot be believed or shows nothing."""
-    ni, nj, nk = moving.shape
-    if a < radius or b < radius or c < radius or a >= ni - radius or b >= nj - radius or c >= nk - radius:
-        return -1.0
-    if not believed[a, b, c]:
-        return -1.0
-    s, ss, sf = 0.0, 0.0, 0.0
-    width = 2 * radius + 1
+def _centred(image, at, radius, step, block):
+    """Fill a block with every `step`-th voxel about `at` less their mean; the sum of its squares."""
+    width, mean, squares = block.shape[0], np.float32(0), np.float32(0)
     for p in range(width):
         for q in range(width):
             for r in range(width):
-                m = moving[a - radius + p, b - radius + q, c - radius + r]
+                value = image[at[0] - radius + step * p, at[1] - radius + step * q, at[2] - radius + step * r]
+                block[p, q, r] = value
+                mean += value
+    mean /= np.float32(width**3)
+    for p in range(width):
+        for q in range(width):
+            for r in range(width):
+                block[p, q, r] -= mean
+                squares += block[p, q, r] ** 2
+    return squares
+
+
+@njit(cache=True, fastmath=True)
+def _correlation(block, ff, moving, believed, a, b, c, radius, step):
+    """NCC of a centred block with every `step`-th voxel of the one about voxel (a, b, c); -1 where that cannot be
+    believed or shows nothing.
+    """
+    ni, nj, nk = moving.shape
+    if a < radius or b < radius or c < radius or a >= ni - radius or b >= nj - radius or c >= nk - radius:
+        return np.float32(-1)
+    if not believed[a, b, c]:
+        return np.float32(-1)
+    width = block.shape[0]
+    s, ss, sf = np.float32(0), np.float32(0), np.float32(0)
+    for p in range(width):
+        for q in range(width):
+            for r in range(width):
+                m = moving[a - radius + step * p, b - radius + step * q, c - radius + step * r]
                 s += m
                 ss += m * m
                 sf += m * block[p, q, r]
-    mm = ss - s * s / width**3
-    if mm < width**3 * flat * flat:
-        return -1.0
+    count = np.float32(width**3)
+    mm = ss - s * s / count
+    if mm < count * np.float32(FLAT_HU**2):
+        return np.float32(-1)
     return sf / np.sqrt(mm * ff)
 
 
-@njit(cache=True, parallel=True, fastmath=True)
-def _blocks(fixed, moving, starts, believed, radius, reach, flat, scores):
-    """Fill scores (n, s, s, s) at every other shift, then at every one near the best of those: peaks are wider."""
-    ni, nj, nk = fixed.shape
+@njit(cache=True, fastmath=True)
+def _climb(block, ff, moving, believed, start, shift, radius, reach, around):
+    """Move `shift` (3,) to the highest of the 27 scores about it until it is itself the highest; its score."""
+    for _ in range(2 * reach):
+        top, at, n = np.float32(-2), 13, 0
+        for a in range(-1, 2):
+            for b in range(-1, 2):
+                for c in range(-1, 2):
+                    x, y, z = shift[0] + a, shift[1] + b, shift[2] + c
+                    ncc = np.float32(-1)
+                    if max(abs(x), abs(y), abs(z)) <= reach:
+                        ncc = _correlation(
+                            block, ff, moving, believed, start[0] + x, start[1] + y, start[2] + z, radius, 1
+                        )
+                    around[n] = ncc
+                    if ncc > top or (ncc == top and n == 13):
+                        top, at = ncc, n
+                    n += 1
+        if at == 13:
+            break
+        shift[0] += at // 9 - 1
+        shift[1] += at // 3 % 3 - 1
+        shift[2] += at % 3 - 1
+    return around[13]
+
+
+@njit(cache=True, fastmath=True)
+def _candidates(block, ff, moving, believed, start, radius, reach, shifts):
+    """Fill shifts (m, 3) with the best of every other one by thinned blocks, best first; how many there are."""
+    scores = np.empty(len(shifts), np.float32)
+    count = 0
+    for di in range(-reach, reach + 1, 2):
+        for dj in range(-reach, reach + 1, 2):
+            for dk in range(-reach, reach + 1, 2):
+                ncc = _correlation(block, ff, moving, believed, start[0] + di, start[1] + dj, start[2] + dk, radius, 2)
+                if ncc <= -1 or (count == len(shifts) and ncc <= scores[count - 1]):
+                    continue
+                count = min(count + 1, len(shifts))
+                m = count - 1
+                while m > 0 and scores[m - 1] < ncc:
+                    scores[m] = scores[m - 1]
+                    shifts[m, 0], shifts[m, 1], shifts[m, 2] = shifts[m - 1, 0], shifts[m - 1, 1], shifts[m - 1, 2]
+                    m -= 1
+                scores[m] = ncc
+                shifts[m, 0], shifts[m, 1], shifts[m, 2] = di, dj, dk
+    return count
+
+
+@njit(cache=True, fastmath=True)
+def _found(fixed, moving, thin_fixed, thin_moving, start, believed, radius, reach, best, around):
+    """One point of `_blocks`."""
     width = 2 * radius + 1
+    for m in range(3):
+        if start[m] < radius or start[m] >= fixed.shape[m] - radius:
+            return
+    whole = np.empty((width, width, width), np.float32)
+    ff = _centred(fixed, start, radius, 1, whole)
+    if ff < np.float32(width**3 * FLAT_HU**2):
+        return
+    thin = np.empty((radius + 1, radius + 1, radius + 1), np.float32)
+    thin_ff = max(_centred(thin_fixed, start, radius, 2, thin), np.float32(1))
+    shifts, near, top = np.empty((CLIMBS, 3), np.int64), np.empty(27, np.float32), np.float32(-1)
+    for m in range(_candidates(thin, thin_ff, thin_moving, believed, start, radius, reach, shifts)):
+        known = False
+        for other in range(m):
+            far = max(abs(shifts[m, 0] - shifts[other, 0]), abs(shifts[m, 1] - shifts[other, 1]))
+            known |= max(far, abs(shifts[m, 2] - shifts[other, 2])) <= 2
+        if known:
+            continue
+        ncc = _climb(whole, ff, moving, believed, start, shifts[m], radius, reach, near)
+        if ncc > top:
+            top = ncc
+            best[0], best[1], best[2] = shifts[m, 0], shifts[m, 1], shifts[m, 2]
+            for n in range(27):
+                around[n] = near[n]
+
+
+@njit(cache=True, parallel=True)
+def _blocks(fixed, moving, thin_fixed, thin_moving, starts, believed, radius, reach, best, around):
+    """Fill shifts (n, 3) of the best blocks and the scores (n, 27) about them.
+
+    Every other voxel of the blurred images is compared at every other shift; from the CLIMBS best of these, whole
+    blocks climb.
+    """
     for n in prange(starts.shape[0]):
-        i, j, k = starts[n, 0], starts[n, 1], starts[n, 2]
-        if min(i, j, k) < radius or i >= ni - radius or j >= nj - radius or k >= nk - radius:
-            continue
-        block = fixed[i - radius : i + radius + 1, j - radius : j + radius + 1, k - radius : k + radius + 1].copy()
-        block -= block.sum() / width**3
-        ff = (block * block).sum()
-        if ff < width**3 * flat * flat:
-            continue
-        best, da, db, dc = -1.0, 0, 0, 0
-        for di in range(-reach, reach + 1, 2):
-            for dj in range(-reach, reach + 1, 2):
-                for dk in range(-reach, reach + 1, 2):
-                    ncc = _correlation(block, ff, moving, believed, i + di, j + dj, k + dk, radius, flat)
-                    scores[n, di + reach, dj + reach, dk + reach] = ncc
-                    if ncc > best:
-                        best, da, db, dc = ncc, di, dj, dk
-        if best <= -1.0:
-            continue
-        for di in range(max(da - 2, -reach), min(da + 2, reach) + 1):
-            for dj in range(max(db - 2, -reach), min(db + 2, reach) + 1):
-                for dk in range(max(dc - 2, -reach), min(dc + 2, reach) + 1):
-                    ncc = _correlation(block, ff, moving, believed, i + di, j + dj, k + dk, radius, flat)
-                    scores[n, di + reach, dj + reach, dk + reach] = ncc
+        _found(fixed, moving, thin_fixed, thin_moving, starts[n], believed, radius, reach, best[n], around[n])

@@ -36,13 +36,14 @@ def gauss_newton(
     steps: int = 15,
     tolerance: float = 1e-3,
     step_mm: float = 0.02,
+    residual: float = 0.1,
     refresh: Callable[[Array], None] | None = None,
 ) -> Descent:
     """Minimize the objective from `start` (3, ni, nj, nk).
 
     Stops when a step lowers the objective by less than `tolerance` of itself, moves no control point by more than
     `step_mm`, or after `steps` steps. Each direction solves H d = -g by Jacobi-preconditioned conjugate gradients to a
-    relative residual of 0.1 or 40 iterations; the step is halved until Armijo's condition (1e-4) holds. refresh:
+    relative residual `residual` or 40 iterations; the step is halved until Armijo's condition (1e-4) holds. refresh:
     called with c before each step, to reset what the objective holds fixed during a step.
     """
     c: Array = start.astype(np.float32)
@@ -53,7 +54,7 @@ def gauss_newton(
         model = objective.model(c)
         value = model.value
         history.append(value)
-        d = conjugate_gradients(model)
+        d = conjugate_gradients(model, residual)
         slope = float(np.vdot(model.gradient, d))
         scale, trial, new = 1.0, c + d, objective.value(c + d)
         while new > value + 1e-4 * scale * slope and scale > 0.02:

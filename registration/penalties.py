@@ -84,6 +84,8 @@ class Matches:
 
     def __init__(self, control: Grid, keypoints: Keypoints, prior: PointMap, weight: float) -> None:
         self._basis = basis_rows(control, keypoints.fixed)
+        self._transposed = sparse.csr_array(self._basis.T)
+        self._squared = self._transposed.multiply(self._transposed).tocsr()
         self._gap = prior(keypoints.fixed) - keypoints.moving
         self._w = weight * keypoints.weights / max(float(keypoints.weights.sum()), 1e-12)
         self._s2 = keypoints.scale_mm**2
@@ -96,11 +98,15 @@ class Matches:
         """Gauss-Newton with the residuals' weights held fixed, as in iterated reweighted least squares."""
         r, q = self._residual(c)
         k = 2 * self._w / (1 + q)
-        gradient = (self._basis.T @ (k[:, None] * r)).T.reshape(c.shape)
-        h = sparse.csr_array(self._basis.T @ sparse.diags_array(k) @ self._basis)
-        diagonal = np.broadcast_to(h.diagonal().reshape(c.shape[1:]), c.shape)
+        gradient = (self._transposed @ (k[:, None] * r)).T.reshape(c.shape)
+        diagonal = np.broadcast_to((self._squared @ k).reshape(c.shape[1:]), c.shape)
         value = float(np.sum(self._w * self._s2 * np.log1p(q)))
-        return Model(value, gradient, lambda d: (h @ d.reshape(3, -1).T).T.reshape(d.shape).astype(d.dtype), diagonal)
+
+        def apply(d: Array) -> Array:
+            along = k[:, None] * (self._basis @ d.reshape(3, -1).T)
+            return (self._transposed @ along).T.reshape(d.shape).astype(d.dtype)
+
+        return Model(value, gradient, apply, diagonal)
 
     def _residual(self, c: Array) -> tuple[Array, Array]:
         r = self._gap + self._basis @ c.reshape(3, -1).T.astype(float)

@@ -64,6 +64,8 @@ def _filtered(volume: Volume, grid: Grid, sigma_mm: Array) -> Volume:
 
 
 def _sampled(voxels: Array, source: Grid, target: Grid, mapping: PointMap | None, fill: float) -> Array:
+    if mapping is None and source.same_as(target):
+        return np.array(voxels, dtype=np.float32)
     if isinstance(mapping, DisplacementField) and mapping.grid.same_as(target):
         displacement = mapping.vectors
         moved = (p + displacement[i].reshape(-1, 3) for i, p in enumerate(slabs(target)))

@@ -8,9 +8,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from math import ceil, log2
 
 import numpy as np
 
+from registration.corrected import on_grid
 from registration.ffd import FfdFit, FfdSettings, register_ffd
 from registration.field import PointMap
 from registration.matching import MatchSettings, match_keypoints
@@ -22,11 +24,16 @@ from registration.volume import Cut, Mask, Volume
 
 OUTSIDE_HU = -1100.0
 BEYOND_MM = 5.0
-LAST_LEVELS = 2
+LEADING_MM = 32.0
+"""Finest control spacing that places lead alone; the finer levels, and this one once more, correct the first map."""
+SOFTER = 1 / 3
+"""Share of the bending weight that these keep: what they correct is small, so it may bend more easily."""
 AROUND_MM = 20.0
 """What is kept around the lungs: more than they grow by, and more than voxels are blurred by."""
 FAR_MM, NEAR_MM = 24.0, 8.0
 """How far along each axis places are looked for about the prior, and about the first map."""
+ROUGHLY = 0.3
+"""Relative residual to which their steps are solved: closer takes longer and ends no nearer."""
 HOLD = 0.5
 """Share of their weight that places keep at the finest levels, where images are nearer than half a voxel."""
 ENOUGH = 300
@@ -52,8 +59,8 @@ def register_sliding(
     (placed by `prior`) carries the moving lung over. seen: field of view of the fixed image. Both images are set to
     -1100 HU outside their lungs and compared inside the fixed lung grown by 5 mm, so the wall is met and nothing
     outside can pull. A smooth wall looks alike wherever it has slid to, and vessels look alike when the map starts far
-    off, so places inside the lung are found first, up to 24 mm off the prior, and lead the coarse levels; found again
-    under that map, they hold the two finest.
+    off, so places inside the lung are found first, up to 24 mm off the prior, and lead the coarse levels, down to a
+    control spacing of 32 mm; found again under that map, they hold the finest, which bend more easily.
     """
     if fixed_lung is None:
         fixed_lung = _carried(fixed, moving, moving_lung, settings, seen, prior)
@@ -66,11 +73,12 @@ def register_sliding(
     inner = Mask(fixed_lung.inside & seen.inside, fixed.ras_from_ijk)
     images = masked(fixed, fixed_lung), masked(moving, moving_lung)
     start = prior or RigidTransform.identity()
+    finer = max(ceil(log2(LEADING_MM / settings.spacing_mm)), 1)
     coarse = replace(
         settings,
-        spacing_mm=2 * settings.spacing_mm,
+        spacing_mm=settings.spacing_mm * 2**finer,
         voxel_mm=1.5 * settings.voxel_mm,
-        levels=max(settings.levels - 1, 1),
+        levels=max(settings.levels - finer, 1),
     )
     voxel = settings.voxel_mm
     found = partial(_found_again, coarsen(fixed, voxel), coarsen(moving, voxel), inner, moving_lung, voxel)
@@ -78,8 +86,9 @@ def register_sliding(
     first = register(settings=coarse, prior=start, keypoints=found(start, FAR_MM)).moving_from_fixed
     holding = found(first, NEAR_MM)
     share = 0.0 if holding is None else HOLD * min(len(holding.fixed) / ENOUGH, 1.0)
-    held = replace(settings.weights, keypoints=share * settings.weights.keypoints)
-    finest = replace(settings, levels=min(settings.levels, LAST_LEVELS), weights=held)
+    weights = settings.weights
+    held = replace(weights, bending=SOFTER * weights.bending, keypoints=share * weights.keypoints)
+    finest = replace(settings, levels=min(settings.levels, finer + 1), weights=held, residual=ROUGHLY)
     return register(settings=finest, prior=first, keypoints=holding)
 
 
@@ -95,12 +104,13 @@ def _found_again(
     """Places inside both lungs that both images show, at most `reach_mm` from where `prior` puts them; None for too
     few.
     """
+    dense = on_grid(prior, fixed.grid)
     pairs = match_keypoints(
-        resample(moving, fixed.grid, prior),
+        resample(moving, fixed.grid, dense),
         fixed,
         resample_mask(fixed_lung, fixed.grid),
         MatchSettings(voxel_mm=voxel_mm, reach_mm=reach_mm),
-        first_region=resample_mask(moving_lung, fixed.grid, prior),
+        first_region=resample_mask(moving_lung, fixed.grid, dense),
     )
     return None if len(pairs) < LEAST_PAIRS else Keypoints(pairs.second, prior(pairs.first), np.ones(len(pairs)))
 

@@ -108,8 +108,8 @@ VARIANTS: dict[str, Variant] = {
     # Bending energy knows no affine map, so a stiff enough free form is one.
     "affine": _ffd("affine map of the lung after the spine", grid_mm=64.0, levels=1, bending=1e6),
     "ffd-32": _ffd("free form, 32 mm grid", grid_mm=32.0, levels=3),
-    "ffd-16": _ffd("free form, 16 mm grid"),
-    "ffd-8": _ffd("free form, 8 mm grid", grid_mm=8.0, levels=5),
+    "ffd-16": _ffd("free form, 16 mm grid", grid_mm=16.0, levels=4),
+    "ffd-8": _ffd("free form, 8 mm grid"),
     "ffd-plain": _ffd("free form of everything seen", plain),
     "ffd-masked": _ffd("free form of masked lungs, as in the paper", masked_only),
     "voxel-1": _ffd("free form, voxels of 1 mm", voxel_mm=1.0),

@@ -70,7 +70,7 @@ def _registered(images: Images, voxel_mm: float) -> dict[str, Any]:
     fixed, moving = _with_voxels(images.fixed, voxel_mm), _with_voxels(images.moving, voxel_mm)
     moving_lung = resample_mask(images.moving_lung, moving.grid)
     lung, usable = (resample_mask(m, fixed.grid) for m in (images.fixed_lung, images.usable))
-    settings = replace(ffd_settings(Settings().registration), voxel_mm=voxel_mm, spacing_mm=8 * voxel_mm)
+    settings = replace(ffd_settings(Settings().registration), voxel_mm=voxel_mm, spacing_mm=4 * voxel_mm)
     stages = Stages()
     with stages.stage("idle"):
         pass

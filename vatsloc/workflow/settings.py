@@ -23,10 +23,10 @@ class RegistrationSettings(_Table):
     """
 
     on: bool = True
-    grid_mm: float = Field(default=16.0, ge=4, le=64)
-    levels: int = Field(default=4, ge=1, le=6)
+    grid_mm: float = Field(default=8.0, ge=4, le=64)
+    levels: int = Field(default=5, ge=1, le=6)
     voxel_mm: float = Field(default=2.0, ge=0.5, le=8)
-    window_mm: float | None = Field(default=14.0, gt=0)
+    window_mm: float | None = Field(default=10.0, gt=0)
     bending: float = Field(default=300.0, gt=0)
 
 
