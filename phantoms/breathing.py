@@ -22,7 +22,7 @@ from phantoms.patient import Patient
 from phantoms.spec import Collapse
 from phantoms.spline import SplineMap
 from phantoms.states import lung_body
-from registration.volume import Grid, Volume
+from phantoms.voxels import Grid, Image
 
 Array = NDArray[Any]
 SUPINE = np.array([0.0, -1.0, 0.0])
@@ -38,9 +38,9 @@ class Breath:
     volume: Array
     states: tuple[State, ...]
     patient: Patient
-    body: Volume
+    body: Image
 
-    def images(self, grid: Grid) -> Iterator[Volume]:
+    def images(self, grid: Grid) -> Iterator[Image]:
         """The image of every state on `grid`, without noise but that of the scan."""
         for state in self.states:
             yield image_state(self.patient, self.body, state, grid).clean
@@ -52,7 +52,7 @@ def volume_signal(count: int, least: float, sharpness: int = 4) -> Array:
     return np.asarray(least + (1 - least) * np.cos(np.pi * t) ** sharpness)
 
 
-def breathe(patient: Patient, body: Volume, volume: Array, element_mm: float, rng: np.random.Generator) -> Breath:
+def breathe(patient: Patient, body: Image, volume: Array, element_mm: float, rng: np.random.Generator) -> Breath:
     """A breath along `volume` (n,), ratios to the scan's, no greater than 1. body: the scan without the lung."""
     knots = np.linspace(volume.min(), 1.0, KNOTS)
     lung = lung_body(patient, Collapse(), element_mm, rng)

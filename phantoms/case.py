@@ -20,7 +20,7 @@ from phantoms.spec import SPECS, PhantomSpec
 from phantoms.states import make_states
 from phantoms.thorax import Thorax, ct_grid, draw_lung_trees, draw_thorax, image_body
 from phantoms.tissue import Equilibrium
-from registration.volume import Grid, Mask, Volume
+from phantoms.voxels import Grid, Image, Region
 
 Array = NDArray[Any]
 CT_BLUR_MM = 0.7
@@ -38,10 +38,10 @@ class PhantomCase:
     spec: PhantomSpec
     seed: int
     side: str
-    ct: Volume
-    cbct_inflated: Volume
-    cbct_deflated: Volume
-    nodule: Mask
+    ct: Image
+    cbct_inflated: Image
+    cbct_deflated: Image
+    nodule: Region
     nodule_ct: Array
     nodule_inflated: Array
     nodule_deflated: Array
@@ -53,7 +53,7 @@ class PhantomCase:
     patient: Patient
     inflated: State
     deflated: State
-    masks: dict[str, Mask]
+    masks: dict[str, Region]
     info: dict[str, Any]
 
 
@@ -80,7 +80,7 @@ def finish_case(
     spec: PhantomSpec,
     seed: int,
     table: tuple[tuple[State, State], Array, list[Equilibrium]],
-    scan: tuple[Volume, Volume, Mask],
+    scan: tuple[Image, Image, Region],
     places: Array,
     rng: np.random.Generator,
 ) -> PhantomCase:
@@ -125,8 +125,8 @@ def finish_case(
 
 
 def _shoot(
-    patient: Patient, body: Volume, state: State, picture: Picture, scanner: Scanner, rng: np.random.Generator
-) -> Volume:
+    patient: Patient, body: Image, state: State, picture: Picture, scanner: Scanner, rng: np.random.Generator
+) -> Image:
     """Cone-beam CT of a state, in the domain that the scanner is simulated in."""
     if scanner.domain == "image":
         return expose(picture.clean, scanner, rng)
@@ -141,7 +141,7 @@ def _moved_grid(grid: Grid, state: State) -> Grid:
     return Grid(grid.shape, affine)
 
 
-def _ct(thorax: Thorax, patient: Patient, spec: PhantomSpec, rng: np.random.Generator) -> tuple[Volume, Volume, Mask]:
+def _ct(thorax: Thorax, patient: Patient, spec: PhantomSpec, rng: np.random.Generator) -> tuple[Image, Image, Region]:
     """The CT, the same without noise and operated lung, and the mask of that lung."""
     grid = ct_grid(thorax, spec.ct_spacing)
     width = float(grid.spacing.mean())
@@ -158,7 +158,7 @@ def _ct(thorax: Thorax, patient: Patient, spec: PhantomSpec, rng: np.random.Gene
     noise = ndimage.gaussian_filter(rng.standard_normal(grid.shape, dtype=np.float32), 0.5)
     hu += noise * (14.0 / noise.std())
     affine = grid.ras_from_ijk
-    return Volume(np.clip(hu, -1024, 3071), affine), Volume(body, affine), Mask(distance < 0, affine)
+    return Image(np.clip(hu, -1024, 3071), affine), Image(body, affine), Region(distance < 0, affine)
 
 
 def _nodule_centre(nodule: Nodule, state: State) -> Array:
@@ -197,7 +197,7 @@ def _landmarks(
     return points[chosen]
 
 
-def _masks(ct_lung: Mask, pictures: list[Picture]) -> dict[str, Mask]:
+def _masks(ct_lung: Region, pictures: list[Picture]) -> dict[str, Region]:
     return {
         "lung_ct": ct_lung,
         "lung_inflated": pictures[0].lung,

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from phantoms.fields import refine, smoothstep
-from registration.volume import Grid, Volume
+from phantoms.voxels import Grid, Image
 
 Array = NDArray[Any]
 OUTSIDE_HU = -1000.0
@@ -42,7 +42,7 @@ def scanner_grid(centre: Array, spacing: tuple[float, float, float], length_mm: 
     return Grid((n[0], n[1], n[2]), affine)
 
 
-def expose(clean: Volume, scanner: Scanner, rng: np.random.Generator) -> Volume:
+def expose(clean: Image, scanner: Scanner, rng: np.random.Generator) -> Image:
     """Image that the scanner makes of `clean` (HU, on the scanner's own grid)."""
     grid = clean.grid
     h = grid.spacing
@@ -59,7 +59,7 @@ def expose(clean: Volume, scanner: Scanner, rng: np.random.Generator) -> Volume:
     signal += _grain(grid, rng) * scanner.noise * (1.15 - 0.45 * share**2) * (1 + 1.5 * bad)
     hu = signal - 1000
     hu = np.where(radius <= scanner.fov / 2, np.clip(hu, -1024, 3071), OUTSIDE_HU)
-    return Volume(np.ascontiguousarray(hu, dtype=np.float32), clean.ras_from_ijk)
+    return Image(np.ascontiguousarray(hu, dtype=np.float32), clean.ras_from_ijk)
 
 
 def _grain(grid: Grid, rng: np.random.Generator) -> Array:

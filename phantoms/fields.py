@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from registration.volume import Grid
+from phantoms.voxels import Grid
 
 Array = NDArray[Any]
 

@@ -17,7 +17,7 @@ from phantoms.patient import Patient
 from phantoms.spline import SplineMap
 from phantoms.thorax import draw_lung_trees
 from phantoms.trees import LungTrees
-from registration.volume import Grid, Mask, Volume
+from phantoms.voxels import Grid, Image, Region
 
 Array = NDArray[Any]
 PLEURAL_AIR_HU = -998.0
@@ -58,12 +58,12 @@ class State:
 class Picture:
     """Noise-free image of a state with masks of the operated lung and of the nodule."""
 
-    clean: Volume
-    lung: Mask
-    nodule: Mask
+    clean: Image
+    lung: Region
+    nodule: Region
 
 
-def image_state(patient: Patient, body: Volume, state: State, grid: Grid) -> Picture:
+def image_state(patient: Patient, body: Image, state: State, grid: Grid) -> Picture:
     """Image of a state on `grid`. body: the CT without its operated lung (HU)."""
     width = float(grid.spacing.mean())
     x = np.stack([a.ravel() for a in np.moveaxis(state_points(state, grid), -1, 0)], axis=1)
@@ -89,7 +89,9 @@ def image_state(patient: Patient, body: Volume, state: State, grid: Grid) -> Pic
     lung[within] = (share > 0.5) & (room[within] > 0.5)
     nodule[within] = lesion > 0.5
     affine = grid.ras_from_ijk
-    return Picture(Volume(hu, affine), Mask(lung.reshape(grid.shape), affine), Mask(nodule.reshape(grid.shape), affine))
+    return Picture(
+        Image(hu, affine), Region(lung.reshape(grid.shape), affine), Region(nodule.reshape(grid.shape), affine)
+    )
 
 
 def state_points(state: State, grid: Grid) -> Array:
@@ -115,7 +117,7 @@ def _coarse(grid: Grid, step_mm: float) -> tuple[Grid, int]:
     return Grid((n[0], n[1], n[2]), affine), step
 
 
-def _walls(body: Volume, state: State, grid: Grid) -> Array:
+def _walls(body: Image, state: State, grid: Grid) -> Array:
     coarse, step = _coarse(grid, 7.0)
     points = state.unposed(coarse.points().reshape(-1, 3))
     source = body.grid.to_ijk(state.motion.inverse(points, 0.02)).reshape(*coarse.shape, 3)

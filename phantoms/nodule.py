@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phantoms.fields import coverage, smoothstep
-from registration.volume import Grid, Mask
+from phantoms.voxels import Grid, Region
 
 Array = NDArray[Any]
 SOLID_HU, GLASS_HU = 25.0, -560.0
@@ -44,7 +44,7 @@ class Nodule:
         return r - self.radius - self.relief * wave
 
 
-def nodule_mask(nodule: Nodule, grid: Grid) -> Mask:
+def nodule_mask(nodule: Nodule, grid: Grid) -> Region:
     """Voxels of the CT whose centres lie in the nodule."""
     inside = np.zeros(grid.shape, dtype=bool)
     reach = nodule.radius + nodule.relief + 2 * grid.spacing.max()
@@ -55,7 +55,7 @@ def nodule_mask(nodule: Nodule, grid: Grid) -> Mask:
     sub = grid.box(lo, corners.max(axis=0) + 1)
     n = sub.shape
     inside[lo[0] : lo[0] + n[0], lo[1] : lo[1] + n[1], lo[2] : lo[2] + n[2]] = nodule.distance(sub.points()) < 0
-    return Mask(inside, grid.ras_from_ijk)
+    return Region(inside, grid.ras_from_ijk)
 
 
 def paint_nodule(hu: Array, grid: Grid, nodule: Nodule, width: float) -> None:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from phantoms.cbct import OUTSIDE_HU, Scanner
-from registration.volume import Grid, Volume
+from phantoms.voxels import Grid, Image
 
 Array = NDArray[Any]
 WATER_PER_MM = 0.02
@@ -84,8 +84,8 @@ def scene_grid(view: Grid) -> Grid:
 
 
 def expose_views(
-    scene: Volume, grid: Grid, scanner: Scanner, rng: np.random.Generator, arm: CArm | None = None
-) -> Volume:
+    scene: Image, grid: Grid, scanner: Scanner, rng: np.random.Generator, arm: CArm | None = None
+) -> Image:
     """Image on `grid` that a C-arm makes of `scene` (HU), turning about the third axis of `grid` through its centre.
 
     scene: as on `scene_grid(grid)`, about the same centre. Raises ModuleNotFoundError without RTK.
@@ -94,18 +94,18 @@ def expose_views(
     return develop(project(attenuation(scene), scene.grid.spacing, arm), grid, scanner, rng, arm)
 
 
-def attenuation(image: Volume) -> Array:
+def attenuation(image: Image) -> Array:
     """Attenuation [i, j, k] per mm of an image in HU."""
     return WATER_PER_MM * np.maximum(1 + image.hu / 1000, 0)
 
 
-def develop(line_integrals: Array, grid: Grid, scanner: Scanner, rng: np.random.Generator, arm: CArm) -> Volume:
+def develop(line_integrals: Array, grid: Grid, scanner: Scanner, rng: np.random.Generator, arm: CArm) -> Image:
     """Image on `grid` from exact line integrals (views, rows, columns): detected, reconstructed, in HU."""
     hu = 1000 * (reconstruct(detect(line_integrals, arm, rng), grid, arm) / WATER_PER_MM - 1)
     i, j = ((np.arange(n) - (n - 1) / 2) * h for n, h in zip(grid.shape[:2], grid.spacing[:2], strict=True))
     within = np.hypot(i[:, None], j[None, :])[:, :, None] <= scanner.fov / 2
     hu = np.where(within, np.clip(hu, -1024, 3071), OUTSIDE_HU)
-    return Volume(np.ascontiguousarray(hu, dtype=np.float32), grid.ras_from_ijk)
+    return Image(np.ascontiguousarray(hu, dtype=np.float32), grid.ras_from_ijk)
 
 
 def project(per_mm: Array, spacing: Array, arm: CArm) -> Array:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from registration.volume import Volume
+from phantoms.voxels import Image
 
 Array = NDArray[Any]
 TISSUES = {"gas": (-1001.0, -985.0), "lung": (-960.0, -500.0), "soft tissue": (0.0, 90.0)}
@@ -17,7 +17,7 @@ RINGS = ((0.0, 0.5), (0.5, 0.8), (0.8, 0.95))
 """Distances from the axis over the radius of the field of view."""
 
 
-def scanner_figures(clean: Volume, shots: tuple[Volume, Volume], fov: float, end_mm: float = 12.0) -> dict[str, float]:
+def scanner_figures(clean: Image, shots: tuple[Image, Image], fov: float, end_mm: float = 12.0) -> dict[str, float]:
     """Errors of two exposures of one scene, by name. clean: the scene, HU; fov: mm; end_mm: what end slices are.
 
     Errors in HU are medians, 2 mm and more inside a tissue; noise is that of the exposures' difference; grain: mm at

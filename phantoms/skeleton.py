@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from phantoms.anatomy import Build, cage_axes, spine_y
 from phantoms.fields import coverage
 from phantoms.trees import draw_tubes
-from registration.volume import Grid
+from phantoms.voxels import Grid
 
 Array = NDArray[Any]
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from phantoms.anatomy import Build, Shapes, spine_y
 from phantoms.fields import coverage, smooth_noise, smoothstep
-from registration.volume import Grid
+from phantoms.voxels import Grid
 
 Array = NDArray[Any]
 MUSCLE_HU, FAT_HU = 52.0, -102.0

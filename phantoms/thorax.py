@@ -18,7 +18,7 @@ from phantoms.skeleton import Vertebra, draw_bones, draw_spine
 from phantoms.soft_tissue import image_soft_tissue
 from phantoms.spec import Lesion
 from phantoms.trees import LungTrees, Tree, draw_tubes, grow, tubes
-from registration.volume import Grid
+from phantoms.voxels import Grid
 
 Array = NDArray[Any]
 BLOOD_HU, WALL_HU, AIR_HU = 42.0, 10.0, -990.0

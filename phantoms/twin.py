@@ -19,7 +19,7 @@ from phantoms.patient import Patient
 from phantoms.spec import PhantomSpec
 from phantoms.states import make_states
 from phantoms.thorax import place_nodule
-from registration.volume import Mask, Volume
+from phantoms.voxels import Image, Region
 
 Array = NDArray[Any]
 FLESH_HU = -200.0
@@ -31,11 +31,11 @@ class Scan:
     """A chest CT and what is seen in it. lungs: by side; spine: (n, 3) centres of the vertebral column, hilum: (3,) of
     the operated lung, RAS mm; nodule: of the CT, or None to put one in."""
 
-    ct: Volume
-    lungs: dict[str, Mask]
+    ct: Image
+    lungs: dict[str, Region]
     spine: Array
     hilum: Array
-    nodule: Mask | None = None
+    nodule: Region | None = None
 
 
 @dataclass(frozen=True)
@@ -45,9 +45,9 @@ class TwinBase:
 
     patient: Patient
     origin: Array
-    ct: Volume
-    body: Volume
-    lung: Mask
+    ct: Image
+    body: Image
+    lung: Region
 
 
 def make_twin(scan: Scan, spec: PhantomSpec, seed: int = 0) -> PhantomCase:
@@ -76,7 +76,7 @@ def twin_base(scan: Scan, spec: PhantomSpec, seed: int, rng: np.random.Generator
     origin, build = chest_frame(scan)
     scan = _shifted(scan, -origin)
     patient = _patient(scan, build, spec, seed, rng)
-    ct = Volume(scan.ct.hu.copy(), scan.ct.ras_from_ijk)
+    ct = Image(scan.ct.hu.copy(), scan.ct.ras_from_ijk)
     if scan.nodule is None:
         paint_nodule(ct.hu, ct.grid, patient.nodule, float(ct.grid.spacing.mean()))
     lung = scan.lungs[spec.side]
@@ -140,7 +140,7 @@ def _patient(scan: Scan, build: Build, spec: PhantomSpec, seed: int, rng: np.ran
     return Patient(spec.side, seed, build, lung, lobes, scan.hilum, nodule, tissue, None)
 
 
-def _distance(mask: Mask, spacing: float) -> Lattice:
+def _distance(mask: Region, spacing: float) -> Lattice:
     """Signed distance (mm) to the surface of a mask, on a lattice wide enough for the lung to be carried in."""
     box = mask.grid.to_ras(np.argwhere(mask.inside))
     lattice = lattice_over(box.min(axis=0) - 24, box.max(axis=0) + 24, spacing)
@@ -148,13 +148,13 @@ def _distance(mask: Mask, spacing: float) -> Lattice:
     return as_distance(lattice, 0.5 - _on(soft, mask, lattice))
 
 
-def _on(values: Array, at: Mask | Volume, lattice: Lattice) -> Array:
+def _on(values: Array, at: Region | Image, lattice: Lattice) -> Array:
     index = at.grid.to_ijk(lattice.points()).T
     sampled = ndimage.map_coordinates(values, index, order=1, mode="nearest", prefilter=False)
     return np.asarray(sampled.reshape(lattice.values.shape))
 
 
-def _lung_tissue(ct: Volume, lung: Mask) -> Lattice:
+def _lung_tissue(ct: Image, lung: Region) -> Lattice:
     """HU of the lung on a lattice as fine as the scan's pixels, but not finer than 1 mm; at the border and beyond, that
     of the nearest tissue well inside."""
     spacing = max(1.0, float(ct.grid.spacing.min()))
@@ -168,7 +168,7 @@ def _lung_tissue(ct: Volume, lung: Mask) -> Lattice:
     return lattice.like(hu[tuple(nearest)])
 
 
-def without_lung(ct: Volume, lung: Mask) -> Volume:
+def without_lung(ct: Image, lung: Region) -> Image:
     """The CT with a lung replaced by the flesh that is nearest to each of its places."""
     spacing = ct.grid.spacing
     found = np.argwhere(lung.inside)
@@ -182,7 +182,7 @@ def without_lung(ct: Volume, lung: Mask) -> Volume:
     hu = ct.hu.copy()
     filled = ct.hu[box][tuple(nearest)]
     hu[box] = np.where(inside, filled, ct.hu[box])
-    return Volume(hu, ct.ras_from_ijk)
+    return Image(hu, ct.ras_from_ijk)
 
 
 def _corners(patient: Patient) -> Array:
@@ -214,11 +214,11 @@ def _shifted(scan: Scan, shift: Array) -> Scan:
     move[:3, 3] = shift
     return replace(
         scan,
-        ct=Volume(scan.ct.hu, move @ scan.ct.ras_from_ijk),
-        lungs={side: Mask(m.inside, move @ m.ras_from_ijk) for side, m in scan.lungs.items()},
+        ct=Image(scan.ct.hu, move @ scan.ct.ras_from_ijk),
+        lungs={side: Region(m.inside, move @ m.ras_from_ijk) for side, m in scan.lungs.items()},
         spine=scan.spine + shift,
         hilum=scan.hilum + shift,
-        nodule=None if scan.nodule is None else Mask(scan.nodule.inside, move @ scan.nodule.ras_from_ijk),
+        nodule=None if scan.nodule is None else Region(scan.nodule.inside, move @ scan.nodule.ras_from_ijk),
     )
 
 
@@ -226,12 +226,12 @@ def _back(made: PhantomCase, origin: Array) -> PhantomCase:
     """The case with its CT, and all that is said in the CT's frame, where the scan was."""
     move = np.eye(4)
     move[:3, 3] = origin
-    masks = {k: Mask(m.inside, move @ m.ras_from_ijk) if k.endswith("_ct") else m for k, m in made.masks.items()}
+    masks = {k: Region(m.inside, move @ m.ras_from_ijk) if k.endswith("_ct") else m for k, m in made.masks.items()}
     shift = np.concatenate([origin, np.zeros(6)])
     return replace(
         made,
-        ct=Volume(made.ct.hu, move @ made.ct.ras_from_ijk),
-        nodule=Mask(made.nodule.inside, move @ made.nodule.ras_from_ijk),
+        ct=Image(made.ct.hu, move @ made.ct.ras_from_ijk),
+        nodule=Region(made.nodule.inside, move @ made.nodule.ras_from_ijk),
         nodule_ct=made.nodule_ct + origin,
         landmarks_ct=made.landmarks_ct + origin,
         dense_truth=made.dense_truth + shift,

@@ -25,6 +25,7 @@ from vatsloc.formats.nifti import write_mask, write_volume
 from vatsloc.imaging.hilum import find_hilum
 from vatsloc.imaging.lungs import Side, segment_lungs
 from vatsloc.imaging.spine import segment_spine
+from vatsloc.phantom_voxels import to_image, to_mask, to_region, to_volume
 from vatsloc.workflow.stages import Say, Stages, quiet
 
 INFO_FILE = "truth/info.json"
@@ -101,8 +102,9 @@ def read_scan(ct: Path, side: Side, nodule: Path | None = None) -> Scan:
     given = None if nodule is None else read_mask(nodule)
     lungs = segment_lungs(image, side, given)
     hilum = find_hilum(lungs.of(side), lungs.airways, side)
-    masks = {"right": lungs.right, "left": lungs.left}
-    return Scan(image, masks, segment_spine(image).centres_ras, hilum.point_ras, given)
+    regions = {"right": to_region(lungs.right), "left": to_region(lungs.left)}
+    own = None if given is None else to_region(given)
+    return Scan(to_image(image), regions, segment_spine(image).centres_ras, hilum.point_ras, own)
 
 
 def _write_whole(make: Callable[[], PhantomCase], folder: Path, made_from: dict[str, Any], say: Say) -> None:
@@ -136,10 +138,10 @@ def _is_phantom(folder: Path) -> bool:
 def _write(phantom: PhantomCase, folder: Path) -> None:
     truth = folder / "truth"
     truth.mkdir()
-    write_volume(folder / "ct.nii.gz", phantom.ct)
-    write_volume(folder / "cbct_inflated.nii.gz", phantom.cbct_inflated)
-    write_volume(folder / "cbct_deflated.nii.gz", phantom.cbct_deflated)
-    write_mask(folder / "nodule.nii.gz", phantom.nodule)
+    write_volume(folder / "ct.nii.gz", to_volume(phantom.ct))
+    write_volume(folder / "cbct_inflated.nii.gz", to_volume(phantom.cbct_inflated))
+    write_volume(folder / "cbct_deflated.nii.gz", to_volume(phantom.cbct_deflated))
+    write_mask(folder / "nodule.nii.gz", to_mask(phantom.nodule))
     write_points(folder / "nodule_ct.mrk.json", _nodule(phantom.nodule_ct))
     write_points(truth / "nodule_cbct_inflated.mrk.json", _nodule(phantom.nodule_inflated))
     write_points(truth / "nodule_cbct_deflated.mrk.json", _nodule(phantom.nodule_deflated))
@@ -150,8 +152,8 @@ def _write(phantom: PhantomCase, folder: Path) -> None:
     ):
         labels = tuple(f"{n + 1}" for n in range(len(points)))
         write_points(folder / f"landmarks_{image}.mrk.json", PointList(points, labels, ("",) * len(points)))
-    for name, mask in phantom.masks.items():
-        write_mask(truth / f"{name}.nii.gz", mask)
+    for name, region in phantom.masks.items():
+        write_mask(truth / f"{name}.nii.gz", to_mask(region))
     np.savetxt(
         truth / "dense_ras_mm.csv", phantom.dense_truth, fmt="%.3f", delimiter=",", header=DENSE_HEADER, comments=""
     )

@@ -9,12 +9,13 @@ import numpy as np
 
 from phantoms.fields import lattice_over
 from phantoms.twin import make_breath
-from registration.volume import Grid, Volume
+from phantoms.voxels import Grid, Image
 from vatsloc.errors import InputRefused
 from vatsloc.formats.folder import PROGRAM, whole_folder
 from vatsloc.formats.nifti import write_volume
 from vatsloc.imaging.lungs import Side
 from vatsloc.phantom_case import read_scan
+from vatsloc.phantom_voxels import to_volume
 from vatsloc.workflow.stages import Say, Stages, quiet
 
 SERIES_FILE = "series.json"
@@ -48,7 +49,7 @@ def write_series(ct: Path, side: Side, folder: Path, count: int, seed: int = 0, 
         back = np.eye(4)
         back[:3, 3] = origin
         for n, image in enumerate(breath.images(Grid((nx, ny, nz), affine))):
-            write_volume(partial / f"state_{n:03d}.nii.gz", Volume(image.hu, back @ affine))
+            write_volume(partial / f"state_{n:03d}.nii.gz", to_volume(Image(image.hu, back @ affine)))
             rows = np.concatenate([points, breath.states[n].from_ct(points)], axis=1) + np.tile(origin, 2)
             head = "ct_x,ct_y,ct_z,state_x,state_y,state_z"
             np.savetxt(partial / f"truth_{n:03d}.csv", rows, fmt="%.3f", delimiter=",", header=head, comments="")

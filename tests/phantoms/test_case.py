@@ -15,12 +15,13 @@ from phantoms.imaging import State, image_state
 from phantoms.lobes import Fissures
 from phantoms.measures import fissure_jump, lobe_overlap
 from phantoms.thorax import ct_grid, draw_thorax, image_body
-from registration.volume import Volume, axis_codes
+from phantoms.voxels import Image
+from registration.volume import axis_codes
 
 COARSE = PhantomSpec("coarse", "left", ct_spacing=(4.0, 4.0, 4.0), cbct_spacing=(4.0, 4.0, 4.0), element=28.0)
 
 
-def _states(case: PhantomCase) -> list[tuple[str, State, Volume]]:
+def _states(case: PhantomCase) -> list[tuple[str, State, Image]]:
     return [
         ("inflated", case.inflated, case.cbct_inflated),
         ("deflated", case.deflated, case.cbct_deflated),
@@ -64,7 +65,7 @@ def test_mass_of_the_lung_is_kept(case: PhantomCase) -> None:
     for _, state, _ in _states(case):
         middle = state.posed(state.lung_map(state.samples)).mean(axis=0)
         grid = scanner_grid(middle, (3.0, 3.0, 3.0), 340.0, 260.0)
-        body = Volume(np.full((4, 4, 4), -1000, dtype=np.float32), np.diag([1.0, 1, 1, 1]))
+        body = Image(np.full((4, 4, 4), -1000, dtype=np.float32), np.diag([1.0, 1, 1, 1]))
         hu = image_state(patient, body, state, grid).clean.hu
         after = (hu[hu > -990] + 1000).sum() * 3.0**3
         assert after == pytest.approx(before, rel=0.01)

@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from phantoms.fields import Lattice, as_distance, coverage, lattice_over, refine, smooth_noise, soft_max
-from registration.volume import Grid
+from phantoms.voxels import Grid
 
 
 def _linear(lattice: Lattice) -> Lattice:

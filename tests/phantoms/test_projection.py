@@ -14,7 +14,7 @@ from phantoms import SPECS, make_case, projection
 from phantoms.cbct import Scanner, scanner_grid
 from phantoms.projection import WATER_PER_MM, CArm, c_arm_of, develop, expose_views, extend, project, scene_grid
 from phantoms.scanner_figures import scanner_figures
-from registration.volume import Array, Volume
+from phantoms.voxels import Array, Image
 from vatsloc.errors import CaseError
 from vatsloc.phantom_case import scanned
 
@@ -25,13 +25,13 @@ ARM = CArm(views=120, pixel=5.0, height=130.0, photons=1e12, scatter=0.0)
 TIGHT = replace(ARM, width=250.0)
 
 
-def _cylinder(radius: float) -> Volume:
+def _cylinder(radius: float) -> Image:
     scene = scene_grid(VIEW)
     axis = np.hypot(*np.moveaxis(scene.points()[..., :2], -1, 0))
-    return Volume(np.where(axis < radius, 0, -1000).astype(np.float32), scene.ras_from_ijk)
+    return Image(np.where(axis < radius, 0, -1000).astype(np.float32), scene.ras_from_ijk)
 
 
-def _profile(image: Volume) -> Array:
+def _profile(image: Image) -> Array:
     """Mean HU in rings 8 mm wide about the axis, in the middle slices."""
     axis = np.hypot(*np.moveaxis(image.grid.points()[..., :2], -1, 0))
     middle = np.s_[:, :, 5:-5]
@@ -51,7 +51,7 @@ def test_a_ball_is_found_where_it_is() -> None:
     place = np.array([22.0, -30.0, 9.0])
     near = np.linalg.norm(scene.points() - place, axis=-1) < 10
     image = expose_views(
-        Volume(np.where(near, 0, -1000).astype(np.float32), scene.ras_from_ijk),
+        Image(np.where(near, 0, -1000).astype(np.float32), scene.ras_from_ijk),
         VIEW,
         SCANNER,
         np.random.default_rng(0),
@@ -75,7 +75,7 @@ def test_truncation_raises_the_rim_and_an_end_of_water_mends_it(monkeypatch: pyt
 def test_noise_falls_with_the_root_of_the_dose_and_scatter_darkens_the_middle() -> None:
     exact = project(projection.attenuation(_cylinder(60.0)), scene_grid(VIEW).spacing, ARM)
 
-    def shot(photons: float, scatter: float, seed: int) -> Volume:
+    def shot(photons: float, scatter: float, seed: int) -> Image:
         return develop(
             exact, VIEW, SCANNER, np.random.default_rng(seed), replace(ARM, photons=photons, scatter=scatter)
         )
@@ -108,11 +108,11 @@ def test_the_c_arm_has_the_field_and_dose_of_the_scanner() -> None:
 
 
 def test_figures_are_the_errors_and_the_noise_put_in() -> None:
-    clean = Volume(np.full((40, 40, 30), 40.0, dtype=np.float32), np.diag([-2.0, -2.0, 2.0, 1.0]))
+    clean = Image(np.full((40, 40, 30), 40.0, dtype=np.float32), np.diag([-2.0, -2.0, 2.0, 1.0]))
     clean.hu[:20] = -800
     rng = np.random.default_rng(0)
     shots = [
-        Volume(clean.hu - 30 + 15 * rng.standard_normal(clean.hu.shape, dtype=np.float32), clean.ras_from_ijk)
+        Image(clean.hu - 30 + 15 * rng.standard_normal(clean.hu.shape, dtype=np.float32), clean.ras_from_ijk)
         for _ in range(2)
     ]
     found = scanner_figures(clean, (shots[0], shots[1]), 80.0)

@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from phantoms.trees import draw_tubes, grow, tubes
-from registration.volume import Grid
+from phantoms.voxels import Grid
 
 
 @pytest.fixture(scope="module")

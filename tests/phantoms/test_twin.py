@@ -14,7 +14,7 @@ from phantoms.anatomy import spine_y
 from phantoms.breathing import breathe, volume_signal
 from phantoms.spec import Lesion
 from phantoms.twin import Scan, TwinBase, chest_frame, make_breath, make_twin, twin_base, without_lung
-from registration.volume import Grid, Mask, Volume
+from phantoms.voxels import Grid, Image, Region
 
 FAR = np.array([40.0, -25.0, 310.0])
 SPEC = PhantomSpec("twin", "right", cbct_spacing=(3.0, 3.0, 3.0), element=24.0, lesion=Lesion(radius=9.0))
@@ -35,8 +35,8 @@ def scan(lobed: PhantomCase) -> Scan:
     heights = np.arange(-150.0, 100.0, 5.0)
     # The vertebral column's middle is some 15 mm behind that of the vertebral bodies.
     spine = np.stack([0 * heights, spine_y(build, heights) - 15, heights], axis=1) + FAR
-    lungs = {"right": Mask(lobed.masks["lung_ct"].inside, affine), "left": Mask(other, affine)}
-    return Scan(Volume(lobed.ct.hu, affine), lungs, spine, lobed.patient.hilum + FAR)
+    lungs = {"right": Region(lobed.masks["lung_ct"].inside, affine), "left": Region(other, affine)}
+    return Scan(Image(lobed.ct.hu, affine), lungs, spine, lobed.patient.hilum + FAR)
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +87,7 @@ def test_twin_is_mapped_both_ways_and_collapses(twin: PhantomCase, scan: Scan) -
 
 
 def test_given_nodule_is_followed_and_not_painted(scan: Scan, lobed: PhantomCase) -> None:
-    given = replace(scan, nodule=Mask(lobed.nodule.inside, scan.ct.ras_from_ijk))
+    given = replace(scan, nodule=Region(lobed.nodule.inside, scan.ct.ras_from_ijk))
     base = twin_base(given, SPEC, 0, np.random.default_rng(0))
     assert np.array_equal(base.ct.hu, scan.ct.hu)
     assert_allclose(base.patient.nodule.centre + base.origin, lobed.nodule_ct + FAR, atol=1e-6)
@@ -132,6 +132,6 @@ def test_breath_starts_at_the_scan_and_reaches_its_volumes(base: TwinBase) -> No
 
 
 def test_breath_of_a_scan_without_a_lung_is_refused(scan: Scan) -> None:
-    empty = Mask(np.zeros(scan.ct.hu.shape, dtype=bool), scan.ct.ras_from_ijk)
+    empty = Region(np.zeros(scan.ct.hu.shape, dtype=bool), scan.ct.ras_from_ijk)
     with pytest.raises(ValueError, match="too little of the left lung"):
         make_breath(replace(scan, lungs=scan.lungs | {"left": empty}), "right", 10, 0.8)

@@ -14,7 +14,7 @@ from phantoms.projection import attenuation, c_arm_of, develop, project, scene_g
 from phantoms.scanner_figures import scanner_figures
 from phantoms.spec import SPECS
 from phantoms.thorax import ct_grid, draw_thorax, image_body
-from registration.volume import Volume
+from phantoms.voxels import Image
 from vatsloc.errors import CaseError
 from vatsloc.phantom_case import scanned
 from vatsloc.workflow.stages import Say, quiet
@@ -32,7 +32,7 @@ def bench_cbct(name: str = "demo", seed: int = 0, say: Say = quiet) -> dict[str,
     thorax = draw_thorax(spec.side, spec.habitus, spec.lesion, seed, spec.fused)
     grid = ct_grid(thorax, spec.ct_spacing)
     other = "left" if spec.side == "right" else "right"
-    body = Volume(image_body(thorax, grid, (other,)), grid.ras_from_ijk)
+    body = Image(image_body(thorax, grid, (other,)), grid.ras_from_ijk)
     view = case.cbct_deflated.grid
     clean = image_state(case.patient, body, case.deflated, view).clean
     scanner = spec.scanner
