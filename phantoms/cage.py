@@ -42,7 +42,7 @@ class CageMotion:
             dz = z - dome + 20
             reach = np.where(dz > 0, 75.0, 130.0)
             up += rise * np.clip(1.08 - rho2, 0, 1) ** 0.9 * np.exp(-((dz / reach) ** 2))
-        ahead = smoothstep(y - spine_y(b, z), 22, 62)
+        ahead = smoothstep(y - spine_y(b, z), 18, 54)
         middle = np.exp(-((x / 62) ** 2)) * smoothstep(z, -190, -110) * (1 - 0.7 * smoothstep(z, 30, 110))
         lateral: Array = -self.side * self.shift * middle * ahead
         wall = smoothstep(self.side * x, 45, 120) * smoothstep(z, -260, -120)
@@ -50,7 +50,7 @@ class CageMotion:
         forward: Array = -0.8 * self.squeeze * smoothstep(y, 0, 80) + 0.25 * self.shift * middle * ahead
         from_spine = np.hypot(np.maximum(np.abs(x) - 24, 0), np.maximum(np.abs(y - spine_y(b, z) + 18) - 36, 0))
         free = smoothstep(from_spine, 0, 45)
-        return np.stack([lateral * free, forward * free, up * free], axis=1)
+        return np.stack([lateral, forward, up * free], axis=1)
 
     def inverse(self, points: Array, tolerance_mm: float = 1e-3) -> Array:
         """CT points (n, 3) that the motion takes to `points` (n, 3), by fixed-point steps."""

@@ -18,7 +18,7 @@ from phantoms.patient import Patient
 from phantoms.projection import expose_views, scene_grid
 from phantoms.spec import SPECS, PhantomSpec
 from phantoms.states import make_states
-from phantoms.thorax import Thorax, ct_grid, draw_lung_trees, draw_thorax, image_body
+from phantoms.thorax import Thorax, ct_grid, draw_lung_trees, draw_table, draw_thorax, image_body
 from phantoms.tissue import Equilibrium
 from phantoms.voxels import Grid, Image, Region
 
@@ -154,6 +154,7 @@ def _ct(thorax: Thorax, patient: Patient, spec: PhantomSpec, rng: np.random.Gene
     hu = body + coverage(distance, width) * (tissue - body)
     draw_lung_trees(hu, thorax.trees[thorax.index(spec.side)], grid, width)
     paint_nodule(hu, grid, patient.nodule, width)
+    draw_table(hu, grid, thorax.shapes.body)
     hu = ndimage.gaussian_filter(hu, CT_BLUR_MM / grid.spacing)
     noise = ndimage.gaussian_filter(rng.standard_normal(grid.shape, dtype=np.float32), 0.5)
     hu += noise * (14.0 / noise.std())

@@ -71,14 +71,16 @@ def image_state(patient: Patient, body: Image, state: State, grid: Grid) -> Pict
     room = coverage(state.cavity.sample(x), width)
     within = np.flatnonzero(room > 0)
     del x
-    source, ratio, edge = _lung_sources(state, grid, within)
-    share = np.ones_like(edge) if state.held else coverage(edge, width)
+    source, ratio, share = _lung_sources(state, grid, within)
+    if state.held:
+        share = np.ones_like(share)
     resting = patient.tissue(source)
     lesion = coverage(patient.nodule.distance(source) * np.cbrt(ratio), width) * share
     if patient.nodule.kind != "given":
         resting += lesion * (patient.nodule.density(source) - resting)
     tissue = np.minimum((resting + 1000) / ratio - 1000, 40.0)
-    inner = PLEURAL_AIR_HU + share * (tissue - PLEURAL_AIR_HU)
+    # Lung that lies against the wall fills all of the room that a voxel has, not a share of that share.
+    inner = PLEURAL_AIR_HU + np.minimum(share / room[within], 1) * (tissue - PLEURAL_AIR_HU)
     flat = hu.ravel()
     flat[within] += room[within] * (inner - flat[within])
     if patient.trees is not None:
@@ -126,21 +128,22 @@ def _walls(body: Image, state: State, grid: Grid) -> Array:
 
 
 def _lung_sources(state: State, grid: Grid, within: Array) -> tuple[Array, Array, Array]:
-    """CT points (n, 3) of the voxels `within` (flat indices), volume ratios (n,), and distances (n,) in mm to the
-    surface of the lobe that a voxel lies deepest in, negative inside; continued beyond the lung."""
+    """CT points (n, 3) of the voxels `within` (flat indices) and volume ratios (n,) by the lobe that a voxel lies
+    deepest in, continued beyond the lung, and the share (n,) of a voxel that all lobes fill together."""
     coarse, step = _coarse(grid, 4.5)
     x = state.unposed(coarse.points().reshape(-1, 3))
     room = state.cavity.sample(x) < 2.0 * step * grid.spacing.max()
     source, ratio = np.zeros((len(within), 3), dtype=np.float32), np.ones(len(within), dtype=np.float32)
-    edge = np.full(len(within), np.inf, dtype=np.float32)
+    edge, share = np.full(len(within), np.inf, dtype=np.float32), np.zeros(len(within), dtype=np.float32)
     for piece, region in zip(state.lung_map.pieces, state.lung_map.lobes.regions, strict=True):
         samples = state.samples[region.sample(state.samples) < 6.0]
         fields = _piece_sources(piece, samples, x, room).reshape(*coarse.shape, 4)
         fine = np.stack([refine(fields[..., m], step, grid.shape).ravel()[within] for m in range(4)], axis=1)
         distance = region.sample(fine[:, :3]) * np.cbrt(fine[:, 3])
+        share += coverage(distance, float(grid.spacing.mean()))
         deeper = distance < edge
         source[deeper], ratio[deeper], edge[deeper] = fine[deeper, :3], fine[deeper, 3], distance[deeper]
-    return source, ratio, edge
+    return source, ratio, np.minimum(share, 1.0)
 
 
 def _piece_sources(piece: SplineMap, samples: Array, x: Array, room: Array) -> Array:

@@ -100,15 +100,16 @@ def _long_bones(build: Build, spine: list[Vertebra], rng: np.random.Generator) -
         if n > 11:
             break
         for side in (1, -1):
-            drop = (38 + 7 * min(n, 6)) * rng.uniform(0.95, 1.05)
+            drop = (48 + 8 * min(n, 5)) * rng.uniform(0.95, 1.05)
             reach = np.deg2rad([150, 158, 164, 167, 167, 165, 158, 145, 130, 115, 95, 80][n])
             angle = np.deg2rad(11) + (reach - np.deg2rad(11)) * t
-            z = (
-                vertebra.centre[2]
-                + 2
-                - drop * (0.15 * t + 0.85 * t * t * (3 - 2 * t) * 0.9 - 0.25 * np.maximum(t - 0.8, 0))
-            )
+            rise = (0.25 + 0.2 * min(n, 4)) * np.maximum(t - 0.8, 0)
+            z = vertebra.centre[2] + 2 - drop * (0.15 * t + 0.765 * t * t * (3 - 2 * t) - rise)
             path = cage_point(build, side, angle, z, 6.0)
+            head = vertebra.centre + np.array(
+                [side * (vertebra.half_width + 2), 2 - vertebra.half_depth, 0.4 * vertebra.height]
+            )
+            bones.append((np.stack([head, path[0]]), 4.0, 2))
             for shift in (-3.0, 0.0, 3.0):
                 bones.append((path + np.array([0, 0, shift]), 3.6, 24 if n < 10 else 30))
     bones += _sternum_and_girdle(build)
@@ -127,6 +128,9 @@ def _sternum_and_girdle(build: Build) -> list[tuple[Array, float, int]]:
         collar = np.array([side * 22, front[0, 1] + 4, z[0] + 12]) + np.outer(t, [side * 125, -34, 36])
         collar[:, 1] += 10 * np.sin(2 * np.pi * t)
         bones.append((collar, 5.5, 12))
+        shoulder = np.array([side * (build.width + 12), -0.25 * build.depth, build.apex - 14])
+        bones.append((shoulder + np.outer(np.linspace(0, 1, 4), [side * 3, 2, 8]), 21.0, 4))
+        bones.append((shoulder + np.outer(np.linspace(0, 1, 4), [side * 26, 14, 70]), 11.0, 4))
         for s in np.linspace(0, 1, 26):
             height = 0.82 * build.apex - s * 1.05 * build.apex
             angle = np.deg2rad(np.linspace(26 + 4 * s, 66 - 34 * s, 10))
@@ -168,8 +172,10 @@ def _draw_vertebra(hu: Array, grid: Grid, v: Vertebra, width: float) -> None:
         arch = np.minimum(arch, _capsule(x, y, z, a, b, 4.6))
     view += coverage(disc, width) * (85 - view)
     view += coverage(np.maximum(canal - 8.2, np.abs(z) - v.height), width) * (25 - view)
-    for part, inner in ((solid, v.marrow), (arch, v.marrow + 120)):
-        view += coverage(part, width) * (560 - view)
+    # The plates at the ends of a body are thinner than its walls.
+    shell = 560 - 290 * (np.abs(z) - half > flat + 1.0)
+    for part, hard, inner in ((solid, shell, v.marrow), (arch, 560, v.marrow + 120)):
+        view += coverage(part, width) * (hard - view)
         view += coverage(part + 1.6, width) * (inner - view)
 
 

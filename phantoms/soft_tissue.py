@@ -27,7 +27,8 @@ def image_soft_tissue(shapes: Shapes, grid: Grid, width: float, rng: np.random.G
     wall = MUSCLE_HU + 6 * patches - 130 * streaks
     fat = FAT_HU + 5 * patches
     outside = fat + muscle * (wall - fat)
-    middle = 15 - 95 * smoothstep(patches + 0.02 * y, -0.4, 1.0)
+    middle = FAT_HU + 12 + 110 * smoothstep(patches - 0.012 * y + 0.3 * fibres, 0.9, 1.5)
+    middle = middle + (1 - smoothstep(y - spine_y(b, z), -14, -6)) * (MUSCLE_HU - middle)
     below = smoothstep(-s.below_diaphragm.values, -1.5, 1.5)
     inside = middle + below * (_belly(b, x, y, z, patches) - middle)
     inside = inside + smoothstep(-s.heart.values, -1.5, 1.5) * (_heart(shapes, patches) - inside)

@@ -61,61 +61,95 @@ class PhantomSpec:
 
 
 _SMALL = PhantomSpec("small", "right", ct_spacing=(1.5, 1.5, 2.0), cbct_spacing=(1.5, 1.5, 1.5), element=18.0)
-_CO2 = Collapse(dome_rise=-14.0, shift=16.0, gas="co2")
+_CO2 = Collapse(dome_rise=-14.0, shift=18.0, gas="co2")
 SPECS = {
     s.name: s
     for s in (
         replace(_SMALL, name="demo", collapse=Collapse(inflated=0.89, deflated=0.55, patchiness=0.6)),
         replace(_SMALL, name="small-right"),
         replace(_SMALL, name="small-left", side="left"),
-        PhantomSpec("right", "right", fused=0.5, collapse=Collapse(lobes_apart=0.1)),
-        PhantomSpec("left", "left", lesion=Lesion(depth=25.0), collapse=Collapse(inflated=0.83, patchiness=0.3)),
+        PhantomSpec("right", "right", fused=0.5, collapse=Collapse(shift=24.0, lobes_apart=0.1)),
         PhantomSpec(
-            "small-collapse", "right", fused=0.8, collapse=Collapse(deflated=0.64, dome_rise=0.0, patchiness=0.6)
+            "left",
+            "left",
+            lesion=Lesion(depth=25.0),
+            collapse=Collapse(inflated=0.85, deflated=0.46, shift=32.0, patchiness=0.3),
+        ),
+        PhantomSpec(
+            "small-collapse",
+            "right",
+            fused=0.8,
+            collapse=Collapse(deflated=0.64, dome_rise=3.0, shift=24.0, patchiness=0.6),
         ),
         PhantomSpec(
             "near-total-collapse",
             "left",
-            fused=0.0,
-            collapse=Collapse(deflated=0.40, dome_rise=12.0, patchiness=0.5, lobes_apart=0.1),
+            fused=0.2,
+            collapse=Collapse(deflated=0.40, dome_rise=12.0, shift=30.0, patchiness=0.5, lobes_apart=0.1),
         ),
         PhantomSpec("co2-right", "right", fused=0.3, lesion=Lesion(depth=20.0, radius=6.0), collapse=_CO2),
-        PhantomSpec("co2-left", "left", lesion=Lesion(radius=10.0), collapse=replace(_CO2, deflated=0.46)),
-        PhantomSpec("high-diaphragm", "right", "obese", lesion=Lesion(depth=10.0), collapse=Collapse(dome_rise=14.0)),
+        PhantomSpec("co2-left", "left", lesion=Lesion(radius=10.0), collapse=replace(_CO2, deflated=0.46, shift=30.0)),
         PhantomSpec(
-            "apex", "left", view=(0.0, 0.0, 45.0), fused=0.4, lesion=Lesion(place="apex", depth=12.0, radius=7.0)
+            "high-diaphragm",
+            "right",
+            "obese",
+            lesion=Lesion(depth=10.0),
+            collapse=Collapse(dome_rise=14.0, shift=22.0),
         ),
         PhantomSpec(
-            "base", "right", fused=0.0, lesion=Lesion(place="base", depth=10.0), collapse=Collapse(lobes_apart=0.1)
+            "apex",
+            "left",
+            view=(0.0, 0.0, 45.0),
+            fused=0.4,
+            lesion=Lesion(place="apex", depth=12.0, radius=7.0),
+            collapse=Collapse(deflated=0.48, shift=25.0),
+        ),
+        PhantomSpec(
+            "base",
+            "right",
+            fused=0.0,
+            lesion=Lesion(place="base", depth=10.0),
+            collapse=Collapse(shift=17.0, lobes_apart=0.1),
         ),
         PhantomSpec(
             "ground-glass",
             "right",
             lesion=Lesion("ground-glass", depth=18.0, radius=9.0),
-            collapse=Collapse(patchiness=0.4),
+            collapse=Collapse(deflated=0.48, shift=29.0, patchiness=0.4),
         ),
-        PhantomSpec("part-solid", "left", fused=0.2, lesion=Lesion("part-solid", radius=11.0)),
+        PhantomSpec(
+            "part-solid", "left", fused=0.4, lesion=Lesion("part-solid", radius=11.0), collapse=Collapse(shift=24.0)
+        ),
         PhantomSpec(
             "tight-view",
             "left",
             view=(0.0, 0.0, 38.0),
             lesion=Lesion(radius=7.0),
+            collapse=Collapse(inflated=0.89, deflated=0.42, dome_rise=14.0, shift=34.0),
             scanner=Scanner(fov=190.0, length=130.0),
         ),
-        PhantomSpec("poor-dose", "left", fused=0.6, lesion=Lesion(radius=6.0), scanner=Scanner(noise=60.0)),
-        PhantomSpec("atelectasis", "right", fused=0.5, collapse=Collapse(atelectasis=0.10)),
+        PhantomSpec(
+            "poor-dose",
+            "left",
+            fused=0.6,
+            lesion=Lesion(radius=6.0),
+            collapse=Collapse(deflated=0.49, shift=26.0),
+            scanner=Scanner(noise=60.0),
+        ),
+        PhantomSpec("atelectasis", "right", fused=0.5, collapse=Collapse(shift=16.0, atelectasis=0.10)),
         PhantomSpec(
             "too-little-seen",
             "right",
             view=(36.0, 0.0, -44.0),
             refused=True,
+            collapse=Collapse(shift=7.0),
             scanner=Scanner(fov=120.0, length=80.0),
         ),
         PhantomSpec(
             "stiff-lung",
             "right",
             collapse=Collapse(
-                inflated=0.91, deflated=0.58, dome_rise=14.0, shift=22.0, patchiness=0.0, stiffness=4.0, root=0.01
+                inflated=0.91, deflated=0.58, dome_rise=14.0, shift=21.0, patchiness=0.3, stiffness=4.0, root=0.01
             ),
         ),
     )

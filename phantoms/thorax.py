@@ -131,12 +131,25 @@ def image_body(thorax: Thorax, grid: Grid, open_lungs: tuple[str, ...]) -> Array
     return hu
 
 
+def draw_table(hu: Array, grid: Grid, body: Lattice) -> None:
+    """Paint the scanner's table under the back into a CT (HU): a hollow shell, bent a little around the patient."""
+    x, y, _ = body.axes
+    under = float(np.broadcast_to(y, body.values.shape)[(body.values < 0) & (np.abs(x) < 60)].min()) - 3
+    at = grid.points()
+    top = under + at[..., 0] ** 2 / 1500 - at[..., 1]
+    free = body.on(grid) > 1.5
+    hu[free & (top > 1.0) & (top < 11.0)] = -930
+    for depth, thick in ((0.0, 1.6), (12.0, 1.2)):
+        share = coverage(np.abs(top - depth - thick) - thick, float(grid.spacing.mean())) * free
+        hu += share * (60 - hu)
+
+
 def draw_lung_trees(hu: Array, trees: LungTrees, grid: Grid, width: float) -> None:
     """Paint vessels and airways of one lung into an image (HU) whose axes are parallel to those of the trees' frame."""
     rng = np.random.default_rng(7)
     blood = np.zeros(grid.shape, dtype=np.float32)
     for tree in (trees.artery, trees.vein):
-        draw_tubes(blood, grid, *tubes(tree, 0.07, rng), width)
+        draw_tubes(blood, grid, *tubes(tree, 0.05, rng), width)
     hu += blood * (BLOOD_HU - hu)
     draw_airways(hu, grid, *tubes(trees.airway, 0.03, rng), width)
 
@@ -144,7 +157,7 @@ def draw_lung_trees(hu: Array, trees: LungTrees, grid: Grid, width: float) -> No
 def draw_airways(hu: Array, grid: Grid, ends: Array, radii: Array, width: float) -> None:
     """Paint tubes with a wall and air inside. radii: (n, 2) mm of the lumen."""
     wall, lumen = np.zeros(grid.shape, dtype=np.float32), np.zeros(grid.shape, dtype=np.float32)
-    draw_tubes(wall, grid, ends, radii + 0.4 + 0.12 * radii, width)
+    draw_tubes(wall, grid, ends, radii + 0.3 + 0.1 * radii, width)
     draw_tubes(lumen, grid, ends, radii, width)
     hu += wall * (WALL_HU - hu)
     hu += lumen * (AIR_HU - hu)
@@ -152,21 +165,18 @@ def draw_airways(hu: Array, grid: Grid, ends: Array, radii: Array, width: float)
 
 def _draw_great_tubes(hu: Array, thorax: Thorax, grid: Grid, width: float) -> None:
     b = thorax.build
-    zs = np.linspace(22, -190, 16)
-    descending = np.stack([np.full(16, -17.0), spine_y(b, zs) + 24, zs], axis=1)
-    arch = np.array([[6, 24, -25], [8, 22, 8], [3, 14, 24], [-8, -4, 31], [-16, -22, 28], descending[0]])
-    cava = np.array([[20, 14, 75], [23, 10, 20], [22, 12, -35]])
-    trunk = np.array([[-12, 32, -35], [-14, 20, -12], [-10, 2, -10]])
     blood = np.zeros(grid.shape, dtype=np.float32)
-    paths = [(arch, 13.5), (descending, 11.5), (cava, 8.5), (trunk, 13.0)]
-    for n, hilum in enumerate(thorax.hila):
-        sign = 1 - 2 * n
-        paths.append((np.array([trunk[-1], [sign * 14, -6, -12], hilum + np.array([0, 5, 2])]), 9.0))
-        paths.append((np.array([[sign * 8, -4, -40], hilum + np.array([0, 9, -14])]), 7.5))
-    for path, radius in paths:
+    for path, radius in _great_vessels(b, thorax.hila):
         ends = np.stack([path[:-1], path[1:]], axis=1)
         draw_tubes(blood, grid, ends, np.full((len(ends), 2), radius), width)
     hu += blood * (BLOOD_HU - hu)
+    zs = np.linspace(b.apex, -190, 20)
+    gullet = np.stack([np.full(20, -4.0), np.minimum(spine_y(b, zs) + 22, -26), zs], axis=1)
+    ends = np.stack([gullet[:-1], gullet[1:]], axis=1)
+    wall = np.zeros(grid.shape, dtype=np.float32)
+    draw_tubes(wall, grid, ends, np.full((19, 2), 6.5), width)
+    hu += wall * (38 - hu)
+    draw_airways(hu, grid, ends[6:9], np.full((3, 2), 1.6), width)
     carina = np.array([0.0, -20.0, 10.0])
     wind = np.array([[0.0, -14.0, b.apex + 40], [0.0, -16.0, 60.0], carina])
     air = [[wind[0], wind[1]], [wind[1], wind[2]]]
@@ -176,6 +186,40 @@ def _draw_great_tubes(hu: Array, thorax: Thorax, grid: Grid, width: float) -> No
         air += [[carina, middle], [middle, hilum]]
         radii += [[7.4 - n, 7.0 - n], [7.0 - n, 6.2 - n]]
     draw_airways(hu, grid, np.array(air), np.array(radii), width)
+
+
+def _great_vessels(b: Build, hila: tuple[Array, Array]) -> list[tuple[Array, float]]:
+    """Paths (n, 3) and radii, mm: aorta and its branches, great veins, pulmonary trunk, its arteries and veins."""
+    zs = np.linspace(20, -190, 16)
+    descending = np.stack([np.full(16, -21.0), spine_y(b, zs) + 17, zs], axis=1)
+    arch = np.array([[4, 18, -30], [9, 20, 4], [4, 13, 26], [-8, -4, 34], [-19, -22, 32], descending[0]])
+    cava = np.array([[19, 14, 62], [22, 8, 20], [23, 8, -40]])
+    trunk = np.array([[-16, 36, -32], [-20, 26, -10], [-16, 8, 0]])
+    azygos = np.stack([np.full(16, 8.0), spine_y(b, zs) + 18, zs], axis=1)
+    top = b.apex - 10
+    paths: list[tuple[Array, float]] = [
+        (arch, 14.5),
+        (descending, 11.5),
+        (cava, 9.5),
+        (trunk, 13.5),
+        (azygos, 3.2),
+        (np.array([arch[2], [12, 2, 60], [24, -4, top]]), 6.0),
+        (np.array([arch[3], [-13, -6, 60], [-22, -8, top]]), 4.4),
+        (np.array([arch[4], [-21, -20, 60], [-40, -14, top + 4]]), 5.2),
+        (np.array([cava[0], [2, 22, 52], [-24, 16, 66], [-44, 6, top]]), 6.5),
+        (np.array([cava[0], [30, 8, top]]), 7.0),
+    ]
+    for n, hilum in enumerate(hila):
+        sign = 1 - 2 * n
+        root = hilum + np.array([0, 5, 2])
+        between = np.array([-2.0, -2.0, -8.0]) if n == 0 else np.array([-22.0, -4.0, 2.0])
+        paths.append((np.array([trunk[-1], between, root, hilum + np.array([9.0 * sign, 1, -4])]), 8.6))
+        left_atrium = b.heart[0] + np.array([12.0 + 16 * sign, -30, 20])
+        paths += [
+            (np.array([left_atrium, hilum + np.array([0, 11, -15])]), 7.0),
+            (np.array([left_atrium - [0, 0, 8], hilum + np.array([3.0 * sign, -2, -30])]), 5.6),
+        ]
+    return paths
 
 
 def _hilum(lung: Lattice, sign: int) -> Array:
@@ -194,14 +238,14 @@ def lung_trees(regions: tuple[Lattice, ...], hilum: Array, sign: int, rng: np.ra
         coarse = np.argwhere(region.values[::2, ::2, ::2] < -1.0) * 2.0 * region.spacing + region.origin
         clouds.append(coarse + rng.uniform(-3, 3, coarse.shape))
     inward = np.array([sign * 12.0, -2.0, -6.0])
-    bundle = grow(clouds, hilum - 0.6 * inward, hilum + 0.8 * inward, 24, 0.68, 2.8)
+    bundle = grow(clouds, hilum - 0.6 * inward, hilum + 0.8 * inward, 12, 0.52, 2.75)
     veins = grow(
         [cloud + rng.uniform(-5, 5, cloud.shape) for cloud in clouds],
         hilum + np.array([0, 12, -14]) - 0.6 * inward,
         hilum + np.array([0, 11, -16]) + 0.8 * inward,
-        24,
-        0.64,
-        2.8,
+        12,
+        0.5,
+        2.75,
     )
     bundle, veins = (t.moved(_keep_inside(t, regions, 4.0)) for t in (bundle, veins))
     across = rng.standard_normal(bundle.nodes.shape)

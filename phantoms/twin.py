@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from phantoms.anatomy import Build
+from phantoms.anatomy import SPINE_MM, Build
 from phantoms.breathing import Breath, breathe, volume_signal
 from phantoms.case import PhantomCase, finish_case
 from phantoms.fields import Lattice, as_distance, lattice_over
@@ -99,7 +99,7 @@ def chest_frame(scan: Scan) -> tuple[Array, Build]:
     origin = np.array([x, y, high[2] - 120 * size])
     build = Build(
         width=float(max(high[0] - x, x - low[0])),
-        depth=float(27 - np.median(scan.spine[:, 1] - y)),
+        depth=float(SPINE_MM - np.median(scan.spine[:, 1] - y)),
         apex=120 * size,
         dome=(domes["right"] - origin[2], domes["left"] - origin[2]),
         fat=(15.0, 15.0),

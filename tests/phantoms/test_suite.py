@@ -63,6 +63,8 @@ def test_a_case_that_is_there_is_kept_and_tabled(
     row = suite.table(made).splitlines()[2]
     assert f"| {demo.info['pose_mm'][0]:.1f} / {demo.info['pose_mm'][1]:.1f} |" in row
     assert f"| {100 * demo.info['affine_share'][1]:.0f} |" in row
+    leaves = demo.info["total_mm"][0]
+    assert f"{leaves:.1f} to {leaves:.1f} mm to the collapsed one" in suite.table(made)
     sheet = tmp_path / "sheet.png"
     write_sheet([tmp_path / "demo"] * 3, sheet)
     picture = cv2.imread(str(sheet), cv2.IMREAD_GRAYSCALE)

@@ -52,6 +52,10 @@ def table(suite: dict[str, dict[str, Any]]) -> str:
     hard = sum(share > 0.2 for share in shares) / len(shares)
     lines.append("")
     lines.append(
+        f"A rigid registration leaves {_span(suite, 'pose_mm')} mm from the CT to the inflated lung, "
+        f"{_span(suite, 'total_mm')} mm to the collapsed one, {_span(suite, 'pneumothorax_mm')} mm between them."
+    )
+    lines.append(
         f"The best affine map leaves {100 * min(shares):.0f} to {100 * max(shares):.0f} % of the collapse, "
         f"more than 20 % in {100 * hard:.0f} % of the cases. Lobes slide along the fissures by up to "
         f"{max(info['fissure_slip_mm'][1][2] for info in suite.values()):.0f} mm."
@@ -62,6 +66,12 @@ def table(suite: dict[str, dict[str, Any]]) -> str:
 def _made(folder: Path, made_from: dict[str, Any]) -> bool:
     info = read_info(folder)
     return info is not None and all(info.get(key) == value for key, value in made_from.items())
+
+
+def _span(suite: dict[str, dict[str, Any]], motion: str) -> str:
+    """Least and greatest mean of a motion over the cases, mm."""
+    means = [info[motion][0] for info in suite.values()]
+    return f"{min(means):.1f} to {max(means):.1f}"
 
 
 def _two(pair: list[float]) -> str:
