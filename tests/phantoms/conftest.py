@@ -13,8 +13,8 @@ LOBED = PhantomSpec(
     ct_spacing=(3.0, 3.0, 3.0),
     cbct_spacing=(3.0, 3.0, 3.0),
     element=24.0,
-    fused=0.25,
-    collapse=Collapse(lobes_apart=0.1),
+    fused=0.1,
+    collapse=Collapse(shift=24.0, lobes_apart=0.1),
 )
 
 
