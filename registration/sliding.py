@@ -51,6 +51,7 @@ def register_sliding(
     fixed_lung: Mask | None = None,
     seen: Mask | None = None,
     prior: PointMap | None = None,
+    is_far: Callable[[Keypoints | None], bool] | None = None,
     progress: Callable[[str, float], None] | None = None,
 ) -> FfdFit:
     """Free-form deformation of a lung alone, whatever its wall does.
@@ -60,7 +61,9 @@ def register_sliding(
     -1100 HU outside their lungs and compared inside the fixed lung grown by 5 mm, so the wall is met and nothing
     outside can pull. A smooth wall looks alike wherever it has slid to, and vessels look alike when the map starts far
     off, so places inside the lung are found first, up to 24 mm off the prior, and lead the coarse levels, down to a
-    control spacing of 32 mm; found again under that map, they hold the finest, which bend more easily.
+    control spacing of 32 mm; found again under that map, they hold the finest, which bend more easily. is_far: told the
+    places found about the prior, says whether the coarse levels are needed (default always); without them those places
+    hold the finest.
     """
     if fixed_lung is None:
         fixed_lung = _carried(fixed, moving, moving_lung, settings, seen, prior)
@@ -83,8 +86,10 @@ def register_sliding(
     voxel = settings.voxel_mm
     found = partial(_found_again, coarsen(fixed, voxel), coarsen(moving, voxel), inner, moving_lung, voxel)
     register = partial(register_ffd, *images, fixed_mask=region, progress=progress)
-    first = register(settings=coarse, prior=start, keypoints=found(start, FAR_MM)).moving_from_fixed
-    holding = found(first, NEAR_MM)
+    first, holding = start, found(start, FAR_MM)
+    if is_far is None or is_far(holding):
+        first = register(settings=coarse, prior=start, keypoints=holding).moving_from_fixed
+        holding = found(first, NEAR_MM)
     share = 0.0 if holding is None else HOLD * min(len(holding.fixed) / ENOUGH, 1.0)
     weights = settings.weights
     held = replace(weights, bending=SOFTER * weights.bending, keypoints=share * weights.keypoints)

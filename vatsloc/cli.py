@@ -45,7 +45,7 @@ def show(data: dict[str, Any]) -> None:
 def localize(
     case: CaseArgument,
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Results folder, written whole or not at all.")],
-    preset: Annotated[str, typer.Option(metavar="NAME", help="fast or balanced.")] = "balanced",
+    preset: Annotated[str, typer.Option(metavar="NAME", help="fast, balanced, accurate or auto.")] = "balanced",
     settings: Annotated[Path | None, typer.Option(metavar="FILE", help="TOML file that overrides the preset.")] = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -85,7 +85,7 @@ def cohort(
         list[Path], typer.Argument(metavar="DIR...", help="Case folders, or folders that hold case folders.")
     ],
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for results and tables; a rerun goes on.")],
-    preset: Annotated[str, typer.Option(metavar="NAME", help="fast or balanced.")] = "balanced",
+    preset: Annotated[str, typer.Option(metavar="NAME", help="fast, balanced, accurate or auto.")] = "balanced",
     settings: Annotated[Path | None, typer.Option(metavar="FILE", help="TOML file that overrides the preset.")] = None,
     jobs: Annotated[int, typer.Option(metavar="N", min=1, help="Cases run at once.")] = 1,
     scheduler: Annotated[
@@ -282,6 +282,17 @@ def stability_fit_command(
 
     stability_fit(cases, out, Settings(), say)
     print(out / "tables.md")
+
+
+@stability.command("choices")
+def stability_choices_command(
+    cases: Annotated[list[Path], typer.Argument(metavar="CASES...", help="Case folders.")],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for choices.md.")],
+) -> None:
+    """Preset auto: how far the nodule moves when a choice is made the other way."""
+    from vatsloc.study.choices import study_choices, table
+
+    print(table(study_choices(cases, out, say=say)))
 
 
 @bench.command("registration")

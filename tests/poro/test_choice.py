@@ -79,6 +79,21 @@ def test_collapsed_lungs_go_finite_and_hold_signorini(system: PoroSystem) -> Non
     assert state.det_f @ system.mesh.volumes > solve(system, theta).det_f @ system.mesh.volumes
 
 
+def test_finite_strain_is_left_out_where_it_moves_nothing_and_kept_where_it_does(system: PoroSystem) -> None:
+    """What the choice is worth: median motion of the nodes between both strain measures, under one load."""
+
+    def apart(theta: Theta) -> float:
+        linear, finite = (solve_in_range(system, theta, LAW, Range(share=share)) for share in (1.0, -1.0))
+        assert (linear.model, finite.model) == (Model.LINEAR, Model.FINITE)
+        return float(np.median(np.linalg.norm(linear.state.u - finite.state.u, axis=1)))
+
+    gentle, strong = Theta(1e-10, 0.9), Theta(1e-6, 0.5, 4.0)
+    assert solve_in_range(system, gentle, LAW).model is Model.LINEAR
+    assert apart(gentle) < 0.5
+    assert solve_in_range(system, strong, LAW).model is Model.FINITE
+    assert apart(strong) > 0.5
+
+
 def test_a_solved_lung_is_kept_as_it_is_or_solved_again(system: PoroSystem) -> None:
     linear = solve(system, Theta(1e-8, 0.8, 2.0))
     kept = keep_in_range(system, linear, LAW, Range(min_det=linear.det_f.min()))

@@ -155,11 +155,22 @@ def test_a_lung_slides_past_a_wall_that_stays() -> None:
     def tube(g: Grid) -> Mask:
         return Mask(np.hypot(*np.moveaxis(g.points() - CENTRE, 3, 0)[:2]) < radius, g.ras_from_ijk)
 
+    told: list[Keypoints | None] = []
+
+    def needless(places: Keypoints | None) -> bool:
+        told.append(places)
+        return False
+
     fit = register_sliding(fixed, moving, tube(WIDE), COARSE, fixed_lung=tube(grid))
+    led = register_sliding(fixed, moving, tube(WIDE), COARSE, fixed_lung=tube(grid), is_far=needless)
+    assert told[0] is not None
+    assert_allclose(np.median(told[0].moving - told[0].fixed, axis=0), slide, atol=0.3)
     rng = np.random.default_rng(5)
     angle, r = rng.uniform(0, 2 * np.pi, 200), rng.uniform(26, 34, 200)
     near = CENTRE + np.stack([r * np.cos(angle), r * np.sin(angle), rng.uniform(-20, 20, 200)], axis=1)
     assert error(fit.moving_from_fixed(near), near + slide).mean() < 0.5
+    assert error(led.moving_from_fixed(near), near + slide).mean() < 0.5
+    assert error(led.moving_from_fixed(near), fit.moving_from_fixed(near)).max() > 0.01  # not the same registrations
     plain = register_ffd(fixed, moving, COARSE)
     assert error(plain.moving_from_fixed(near), near + slide).mean() > 2.0
 

@@ -149,9 +149,12 @@ def test_what_was_chosen_is_told_with_its_reason():
         {"name": "regional", "before_mm": 3.214, "after_mm": 2.5, "kept": True},
         {"name": "elastic", "before_mm": 2.5, "after_mm": None, "kept": False},
     ]
-    solid = {"model": "linear strain", "why": "linear strain: 0.02 % of the elements are out of range"}
-    page = words_alone(solid=solid, residuals={"ladder": rungs})
-    assert '<dd id="solid">linear strain: 0.02 % of the elements are out of range</dd>' in page
+    strain = {"part": "finite strain", "kept": False, "why": "0.02 % of the elements are out of range"}
+    skipped = {"finite strain": strain["why"], "keypoints": "switched off"}
+    page = words_alone(choices=[strain], skipped=skipped, residuals={"ladder": rungs})
+    assert "<dt>finite strain</dt><dd>left out: 0.02 % of the elements are out of range</dd>" in page
+    assert page.count("0.02 % of the elements") == 1
+    assert "<dt>left out: keypoints</dt><dd>switched off</dd>" in page
     assert (
         "<dt>taken: regional</dt><dd>median misfit at places held back 3.21 mm without it, 2.5 mm with it</dd>" in page
     )
@@ -261,12 +264,15 @@ def test_bars_are_as_long_as_their_numbers():
     assert_allclose(widths[1] / widths[0], 0.25, atol=1e-3)
 
 
-def test_box_spans_the_quartiles():
-    plot = box_plot({"phase": np.array([0.0, 1, 2, 3, 4, np.nan]), "none": np.array([np.nan])}, "x")
+def test_box_spans_the_quartiles_on_a_logarithmic_axis():
+    plot = box_plot({"phase": np.array([0.0, 0.5, 1, 2, 5, np.nan]), "none": np.array([np.nan])}, "x")
     ticks = {
         float(t): float(x) for x, t in re.findall(r'<text x="([^"]*)" y="[^"]*" text-anchor="middle">([^<]*)<', plot)
     }
     x, width = re.search(r'<rect x="([^"]*)" y="[^"]*" width="([^"]*)"', plot).groups()
-    assert ticks[0.0] == LABEL
-    assert_allclose([float(x), float(x) + float(width)], [ticks[1.0], ticks[3.0]], atol=0.1)
+    assert ticks[0.1] == LABEL
+    assert_allclose(ticks[1.0] - ticks[0.1], ticks[5.0] - ticks[0.5], atol=0.2)
+    assert_allclose([float(x), float(x) + float(width)], [ticks[0.5], ticks[2.0]], atol=0.1)
     assert plot.count("<circle") == 5
+    assert f'cx="{LABEL}"' in plot  # no error at all has its place at the axis' start
+    assert max(ticks) == 5.0

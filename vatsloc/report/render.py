@@ -45,6 +45,8 @@ _SHOWN = {
     "peak_mb",
     "peak_mb_by_stage",
     "skipped",
+    "choices",
+    "solid",
     "gates",
     "warnings",
 }
@@ -68,6 +70,7 @@ def render(data: ReportData) -> str:
     gates = data.run.get("gates", {})
     seconds = data.run.get("seconds", {})
     stages = {name: float(s) for name, s in seconds.items() if name != "total"}
+    chosen = {choice["part"] for choice in data.run.get("choices", ())}
     memory = data.run.get("peak_mb_by_stage") or {"whole run": data.run.get("peak_mb")}
     memory = {name: float(mb) for name, mb in memory.items() if mb is not None}
     return _page("report.html").render(
@@ -90,6 +93,7 @@ def render(data: ReportData) -> str:
         seconds_chart=bars(stages, "s", "seconds per stage") if stages else None,
         memory_chart=bars(memory, "MB", "highest memory per stage") if memory else None,
         rest={k: json.dumps(v, indent=1, default=str) for k, v in data.run.items() if k not in _SHOWN},
+        skipped={name: why for name, why in data.run.get("skipped", {}).items() if name not in chosen},
         colours={"nodule": NODULE, "lung": LUNG, "cage": MESH, "inflated": SURFACE},
         scores_from=Markup(SCORES_FROM),
         scores_to=Markup(SCORES_TO),

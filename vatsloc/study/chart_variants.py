@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
+from math import inf
 from typing import Any, cast
 
 from registration.corrected import CorrectedMap
@@ -86,6 +87,9 @@ def elastix(fixed: Volume, moving: Volume, _lung: Mask, settings: FfdSettings, *
     return FfdFit(cast(CorrectedMap, found), Stop.ITERATIONS, (), float("nan"), 0.0, 1.0)
 
 
+_OFF = {"on": False}
+
+
 def _ffd(says: str, register: Register = register_sliding, **over: float) -> Variant:
     return Variant(says, Scored.POSE, {"registration": over}, register=register)
 
@@ -99,8 +103,18 @@ def _model(
     return Variant(says, Scored.COLLAPSE, changed)
 
 
+def _solid(edge_mm: float, finite: bool) -> Variant:
+    """The model fitted to the surface and nothing else, on one mesh with one strain measure."""
+    says = f"{'finite' if finite else 'linear'} strain, {edge_mm:g} mm tetrahedra, fitted to the surface alone"
+    strained = {"strained_share": -1.0 if finite else 1.0}
+    return Variant(
+        says,
+        Scored.COLLAPSE,
+        {"mesh": {"model_edge_mm": edge_mm}, "leave_out": strained, "residual": _OFF, "keypoints": _OFF},
+    )
+
+
 # What is left on is not scored; the pose needs none of it.
-_OFF = {"on": False}
 _SPINE_ALONE = {"registration": _OFF, "residual": _OFF, "keypoints": _OFF, "model": {"max_steps": 1}}
 
 VARIANTS: dict[str, Variant] = {
@@ -115,6 +129,11 @@ VARIANTS: dict[str, Variant] = {
     "voxel-1": _ffd("free form, voxels of 1 mm", voxel_mm=1.0),
     "voxel-1.5": _ffd("free form, voxels of 1.5 mm", voxel_mm=1.5),
     "voxel-3": _ffd("free form, voxels of 3 mm", voxel_mm=3.0),
+    "no-first": Variant(
+        "free form, 16 mm grid, without its first registration",
+        Scored.POSE,
+        {"leave_out": {"first_registration_mm": inf}},
+    ),
     "elastix": _ffd("itk-elastix, 16 mm grid", elastix),
     "no-pose": Variant("no change of pose", Scored.COLLAPSE, {"registration": {"on": False}}),
     "tetrahedra-12": _model("model of 12 mm tetrahedra", edge_mm=12.0),
@@ -141,6 +160,8 @@ VARIANTS: dict[str, Variant] = {
     "no-diaphragm-alone": _model(
         "diaphragm held still, without residual registration", residual=False, diaphragm=False
     ),
+    **{f"linear-{edge}": _solid(edge, finite=False) for edge in (12, 8, 5)},
+    **{f"finite-{edge}": _solid(edge, finite=True) for edge in (12, 8, 5)},
     **{name: Variant(f"preset {name}", Scored.ALL, preset=name) for name in PRESETS},
 }
 """Every variant by name. The order is that of their runs."""

@@ -11,7 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from poro.choice import Chosen, keep_in_range
+from poro.choice import Chosen, Range, keep_in_range
+from poro.choice import Model as Strain
 from poro.correct import correct, pull_of
 from poro.fit import Fit, FitSettings, FitStatus, fit
 from poro.laws import neo_hookean
@@ -24,6 +25,7 @@ from registration.matching import MatchSettings, Pairs, match_keypoints
 from registration.volume import Array
 from vatsloc.imaging.surface import Border, SurfacePoints
 from vatsloc.maps import MeshMap
+from vatsloc.workflow.choices import Choice
 from vatsloc.workflow.observe import Observed
 from vatsloc.workflow.prepare import Prepared
 from vatsloc.workflow.settings import KeypointSettings, Settings
@@ -36,6 +38,8 @@ BLOCK_MM = 40.0
 LEAST_PAIRS = 40
 CORRECTION_STRAINS = (0.05, 0.025, 0.0125)
 MOST_INVERTED = 0.001
+STRAIN = "finite strain"
+"""A part that the scene has a say in."""
 GAIN = 0.95
 """A rung has to bring the misfit below this share of the one before."""
 
@@ -89,7 +93,10 @@ def climb(gravity: Array, prepared: Prepared, observed: Observed, settings: Sett
     surface = surface_target(observed.surface)
     with stages.stage("fit"):
         plain = fit(system, surface, fit_settings(settings))
-        solid = keep_in_range(system, plain.state, neo_hookean(tissue))
+        within = Range(share=settings.leave_out.strained_share)
+        solid = keep_in_range(system, plain.state, neo_hookean(tissue), within)
+    is_finite = solid.model is Strain.FINITE
+    stages.choose(Choice(STRAIN, is_finite, solid.why, solid.share, within.share))
     start = Model(system, replace(plain, state=solid.state), solid.state.u, NO_PAIRS, (), solid, NO_OTHERS)
     model, blind = _rungs(start, surface, prepared, observed, settings, stages)
     if any(rung.kept for rung in model.rungs):

@@ -208,8 +208,6 @@ def _note(pose: ChangeOfPose, collapse: Collapse, stages: Stages) -> None:
         stages.warn("Too little lung is seen in both CBCTs to correct the model by what they show inside it.")
     if not collapse.observed.found.is_collapsed:
         stages.warn("The deflated CBCT shows hardly any pleural air, so the lung may not have collapsed.")
-    if pose.ffd is not None and pose.seen.all():
-        stages.skip("extrapolation", "the inflated CBCT shows the whole lung")
     unsettled = collapse.fit.status
     if unsettled is not FitStatus.CONVERGED:
         stages.warn(f"The fit ended early: {unsettled.value}.")

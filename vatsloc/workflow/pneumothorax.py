@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from poro.fit import Fit
 from poro.mesh import TetMesh, TriSurface, interpolate, locate
 from poro.model import PoroSystem
@@ -11,6 +13,7 @@ from registration.rigid import RigidTransform
 from registration.volume import Array
 from vatsloc.case import Case
 from vatsloc.maps import MeshMap
+from vatsloc.workflow.choices import weigh
 from vatsloc.workflow.ladder import Model, climb
 from vatsloc.workflow.observe import Observed, observe
 from vatsloc.workflow.pose import ChangeOfPose
@@ -18,6 +21,8 @@ from vatsloc.workflow.prepare import Prepared
 from vatsloc.workflow.residual import Residual, residual_registration
 from vatsloc.workflow.settings import Settings
 from vatsloc.workflow.stages import Stages
+
+RESIDUAL = "residual registration"
 
 
 @dataclass(frozen=True)
@@ -77,12 +82,16 @@ def collapse(
     before = observed.mesh_before
     after = before.points + interpolate(locate(observed.model_mesh, before.points), model.displacement)
     if not settings.residual.on:
-        stages.skip("residual registration", "switched off in the settings")
+        stages.skip(RESIDUAL, "switched off in the settings")
+        return Collapse(observed, model, None, after)
+    misfit_mm = np.inf if model.held_back_mm is None else model.held_back_mm
+    seen = f"the model misses places that it has not seen by {misfit_mm:.2f} mm (median)"
+    if not stages.choose(weigh(RESIDUAL, misfit_mm, settings.leave_out.residual_mm, seen)):
         return Collapse(observed, model, None, after)
     rigid, chosen = observed.def_from_inf_rigid, settings.residual
     if any(rung.kept for rung in model.rungs):
         chosen = chosen.model_copy(update={"levels": max(chosen.levels - 1, 1)})
-    with stages.stage("residual registration"):
+    with stages.stage(RESIDUAL):
         residual = residual_registration(
             prepared,
             observed.found.lung,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from scipy import ndimage
@@ -12,7 +13,9 @@ from poro.extrapolate import Extrapolation, extrapolate
 from poro.mesh import TetMesh, stuff
 from poro.tissue import Tissue
 from registration.ffd import FfdFit, FfdSettings, Weights
+from registration.field import PointMap
 from registration.inversion import Inversion, invert_at
+from registration.penalties import Keypoints
 from registration.resample import coarsen_mask
 from registration.rigid import RigidTransform
 from registration.sliding import register_sliding
@@ -22,6 +25,7 @@ from vatsloc.case import Case
 from vatsloc.imaging.lungs import Side
 from vatsloc.imaging.thorax import carry_prior, inflated_lung, require_share, visible_share
 from vatsloc.maps import MeshMap
+from vatsloc.workflow.choices import Choice, weigh
 from vatsloc.workflow.prepare import Prepared
 from vatsloc.workflow.settings import RegistrationSettings, Settings
 from vatsloc.workflow.stages import Stages
@@ -30,6 +34,8 @@ RIM_MM = 4.0
 """Nodes nearer than this to the rim of what the scanner saw are left to the extrapolation."""
 HINT_REACH_MM = 10.0
 """How far a marked vertebra may be off: less than half the distance to the next one."""
+FIRST, EXTRAPOLATION = "first registration", "extrapolation"
+"""Parts that the scene has a say in; the first is the coarse levels, led by places found far off the spine's pose."""
 Register = Callable[..., FfdFit]
 """A registration that is called as `register_sliding` is."""
 
@@ -38,8 +44,9 @@ Register = Callable[..., FfdFit]
 class ChangeOfPose:
     """The lung before its collapse. mesh_ct, points_inf: the same nodes in the CT and in the inflated CBCT, mm.
 
-    ffd, its inversion at the nodes and extrapolation: None where the lung was left to the spine alone; seen: (n,) nodes
-    that the scanner saw; lung_inf: lung mask in the CBCT; overlap: share of the lung in its field of view.
+    ffd, its inversion at the nodes: None where the lung was left to the spine alone; extrapolation: None there too, and
+    where it was left out; seen: (n,) nodes that the scanner saw; lung_inf: lung mask in the CBCT; overlap: share of the
+    lung in its field of view.
     """
 
     rigid: RigidFit
@@ -105,25 +112,48 @@ def change_of_pose(
             fixed_lung=lung_inf,
             seen=prepared.inflated.field.usable,
             prior=ct_from_inf_rigid,
+            is_far=partial(is_far, ct_from_inf_rigid, settings.leave_out.first_registration_mm, stages),
             progress=lambda what, _share: stages.say(what),
         )
     with stages.stage("inversion and extrapolation"):
         inversion = invert_at(ffd.moving_from_fixed, mesh.points, placed.points)
-        seen = _deep_inside(prepared.inflated.field.usable, inversion.points_fixed)
-        seen &= inversion.residual_mm < settings.gates.max_inversion_mm
-        nodes = np.flatnonzero(seen)
-        extension = extrapolate(placed, nodes, (inversion.points_fixed - placed.points)[nodes], Tissue())
+        settled = inversion.residual_mm < settings.gates.max_inversion_mm
+        seen = _deep_inside(prepared.inflated.field.usable, inversion.points_fixed) & settled
+        points = np.where(settled[:, None], inversion.points_fixed, placed.points)
+        extension = None
+        if stages.choose(extrapolated(seen, settings.leave_out.unseen_share)):
+            nodes = np.flatnonzero(seen)
+            extension = extrapolate(placed, nodes, (points - placed.points)[nodes], Tissue())
+            points = placed.points + extension.u
     return ChangeOfPose(
         rigid=rigid,
         ffd=ffd,
         lung_inf=lung_inf,
         mesh_ct=mesh,
-        points_inf=placed.points + extension.u,
+        points_inf=points,
         seen=seen,
         inversion=inversion,
         extrapolation=extension,
         overlap=overlap,
     )
+
+
+def is_far(prior: PointMap, limit_mm: float, stages: Stages, places: Keypoints | None) -> bool:
+    """Whether places inside the lung moved so far that the coarse levels are needed."""
+    if places is None:
+        moved, seen = np.inf, "too few places inside the lung were found about the spine's pose"
+    else:
+        moved = float(np.percentile(np.linalg.norm(places.moving - prior(places.fixed), axis=1), 95))
+        seen = f"95 % of {len(places.fixed)} places inside the lung moved by at most {moved:.1f} mm against the spine"
+    return stages.choose(weigh(FIRST, moved, limit_mm, seen))
+
+
+def extrapolated(seen: Array, limit: float) -> Choice:
+    """Whether the motion has to be continued to what the scanner does not see; the spline's own tail may do for a few
+    nodes.
+    """
+    share = np.count_nonzero(~seen) / len(seen)
+    return weigh(EXTRAPOLATION, share, limit, f"{100 * share:.1f} % of the lung's nodes are out of view", "%")
 
 
 def ffd_settings(settings: RegistrationSettings) -> FfdSettings:

@@ -177,6 +177,7 @@ def _record(case: Case, found: Localization, settings: Settings, stages: Stages)
             "input_sha256": dict(case.input_sha256),
             "side": case.side,
             "gravity_ras": case.gravity_ras,
+            "choices": [choice.entry() for choice in stages.choices],
             "solid": found.collapse.model.solid.entry(),
             "cbct_preparation": {
                 "inflated": found.prepared.inflated.removed.entry(),
@@ -226,8 +227,9 @@ def _spine(fit: RigidFit) -> dict[str, Any]:
 
 
 def _change_of_pose(pose: ChangeOfPose) -> dict[str, Any]:
-    if pose.ffd is None or pose.inversion is None or pose.extrapolation is None:
+    if pose.ffd is None or pose.inversion is None:
         return {"free_form": None, "extrapolation": None}
+    extended = pose.extrapolation
     return {
         "free_form": {
             "status": pose.ffd.status.value,
@@ -235,11 +237,13 @@ def _change_of_pose(pose: ChangeOfPose) -> dict[str, Any]:
             "folded_share": pose.ffd.folded_share,
         },
         "inversion_mm": {"max_at_seen_nodes": pose.inversion.residual_mm[pose.seen].max(initial=0.0)},
-        "extrapolation": {
-            "status": pose.extrapolation.status.value,
+        "extrapolation": None
+        if extended is None
+        else {
+            "status": extended.status.value,
             "imposed_nodes": int(pose.seen.sum()),
-            "released_nodes": len(pose.extrapolation.released),
-            "min_det": pose.extrapolation.det_f.min(),
+            "released_nodes": len(extended.released),
+            "min_det": extended.det_f.min(),
         },
     }
 

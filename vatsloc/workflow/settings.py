@@ -78,6 +78,20 @@ class ResidualSettings(_Table):
     max_disagreement_mm: float = Field(default=3.0, gt=0)
 
 
+class LeaveOutSettings(_Table):
+    """Up to which value, measured on the scene, a part is left out.
+
+    first_registration_mm: how far 95 % of the places inside the lung moved against the spine; residual_mm: median
+    misfit of the model at places that it has not seen; unseen_share: of the lung's nodes (extrapolation);
+    strained_share: of elements beyond the range of linear strain (finite strain). -1 keeps a part whatever is seen.
+    """
+
+    first_registration_mm: float = Field(default=-1.0, ge=-1)
+    residual_mm: float = Field(default=-1.0, ge=-1)
+    unseen_share: float = Field(default=0.0, ge=-1)
+    strained_share: float = Field(default=0.001, ge=-1)
+
+
 class GateSettings(_Table):
     """Limits beyond which a result is marked as not to be trusted."""
 
@@ -104,6 +118,7 @@ class Settings(_Table):
     model: ModelSettings = ModelSettings()
     keypoints: KeypointSettings = KeypointSettings()
     residual: ResidualSettings = ResidualSettings()
+    leave_out: LeaveOutSettings = LeaveOutSettings()
     gates: GateSettings = GateSettings()
 
 
@@ -113,6 +128,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "mesh": {"edge_mm": 10.0, "model_edge_mm": 16.0},
     },
     "balanced": {},
+    "auto": {"leave_out": {"first_registration_mm": 10.0, "residual_mm": 0.8, "unseen_share": 0.01}},
 }
 
 

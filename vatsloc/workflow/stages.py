@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from vatsloc.errors import InputRefused
+from vatsloc.workflow.choices import Choice
 
 Say = Callable[[str], None]
 
@@ -22,7 +23,7 @@ def quiet(_message: str) -> None:
 @dataclass
 class Stages:
     """Log of a run. seconds, cpu_seconds (all threads) and peak_mb: by stage name, in the order they ran; skipped:
-    stage -> why.
+    stage -> why; choices: what the scene had a say in.
     """
 
     say: Say = quiet
@@ -30,6 +31,7 @@ class Stages:
     cpu_seconds: dict[str, float] = field(default_factory=dict)
     peak_mb: dict[str, float] = field(default_factory=dict)
     skipped: dict[str, str] = field(default_factory=dict)
+    choices: list[Choice] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     _start: float = field(default_factory=time.perf_counter)
 
@@ -55,6 +57,13 @@ class Stages:
         """Note that the stage `name` was left out."""
         self.skipped[name] = why
         self.say(f"{name}: skipped, {why}")
+
+    def choose(self, choice: Choice) -> bool:
+        """Note a choice, and whether its part is kept."""
+        self.choices.append(choice)
+        if not choice.kept:
+            self.skip(choice.part, choice.why)
+        return choice.kept
 
     def warn(self, sentence: str) -> None:
         """Note something the reader of the result has to know."""
