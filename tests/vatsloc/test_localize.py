@@ -72,6 +72,9 @@ def test_every_output_is_there(result: Path) -> None:
 def test_run_holds_the_agreed_keys(run: dict[str, Any]) -> None:
     agreed = {"status", "nodule_lps", "nodule_ellipsoid95_mm", "theta", "seconds", "peak_mb", "skipped", "gates"}
     assert agreed | {"warnings"} <= set(run)
+    parts = ["first registration", "extrapolation", "finite strain", "residual registration"]
+    assert [choice["part"] for choice in run["choices"]] == parts
+    assert {choice["part"] for choice in run["choices"] if not choice["kept"]} <= set(run["skipped"])
     assert set(run["theta"]) == {"kappa_b", "phi", "d_diaph_mm"}
     assert all(set(gate) >= {"ok", "value", "limit"} for gate in run["gates"].values())
     layer = f"The pressure layer, {Tissue().layer_mm(run['theta']['kappa_b']):.1f} mm, "

@@ -151,8 +151,13 @@ def test_what_was_chosen_is_told_with_its_reason():
     ]
     strain = {"part": "finite strain", "kept": False, "why": "0.02 % of the elements are out of range"}
     skipped = {"finite strain": strain["why"], "keypoints": "switched off"}
-    page = words_alone(choices=[strain], skipped=skipped, residuals={"ladder": rungs})
+    page = words_alone(
+        choices=[strain, strain | {"part": "extrapolation", "kept": True, "why": "unseen"}],
+        skipped=skipped,
+        residuals={"ladder": rungs},
+    )
     assert "<dt>finite strain</dt><dd>left out: 0.02 % of the elements are out of range</dd>" in page
+    assert "<summary>2 parts weighed, 1 left out as needless</summary>" in page
     assert page.count("0.02 % of the elements") == 1
     assert "<dt>left out: keypoints</dt><dd>switched off</dd>" in page
     assert (

@@ -128,6 +128,11 @@ PRESETS: dict[str, dict[str, Any]] = {
         "mesh": {"edge_mm": 10.0, "model_edge_mm": 16.0},
     },
     "balanced": {},
+    "accurate": {
+        "registration": {"grid_mm": 8.0, "levels": 5, "voxel_mm": 1.5},
+        "mesh": {"edge_mm": 6.0},
+        "residual": {"grid_mm": 10.0, "voxel_mm": 1.5},
+    },
     "auto": {"leave_out": {"first_registration_mm": 10.0, "residual_mm": 0.8, "unseen_share": 0.01}},
 }
 
