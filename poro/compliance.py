@@ -64,10 +64,19 @@ class Compliance:
         """Motion (k, k) of contact nodes (k,) along directions (k, 3) under unit forces at them along these."""
         return _between(self.matrix, nodes, along)
 
+    def across(self, nodes: Array, along: Array, others: Array, toward: Array) -> Array:
+        """Motion (k, m) of contact nodes (k,) along (k, 3) under unit forces at others (m,) toward (m, 3)."""
+        return _across(self.matrix, nodes, along, others, toward)
+
     def apply(self, force: Array) -> Array:
         """Displacements (nc, 3) of all contact nodes under forces (nc, 3), most of them zero."""
         loaded = np.flatnonzero(force.any(axis=1))
         return _apply(self.matrix, loaded, force[loaded]).reshape(-1, 3)
+
+    def apply_many(self, force: Array) -> Array:
+        """`apply` for many forces (b, nc, 3) at once, a product of matrices, in the matrix's own precision."""
+        flat = force.reshape(len(force), -1).astype(self.matrix.dtype, copy=False) @ self.matrix
+        return flat.astype(float, copy=False).reshape(force.shape)
 
 
 def _bisect(points: Array, groups: int) -> Array:
@@ -121,6 +130,21 @@ def _between(matrix: Array, nodes: Array, along: Array) -> Array:
         for i in range(start, count):
             for j in range(start, min(start + tile, i)):
                 result[j, i] = result[i, j]
+    return result
+
+
+@njit(cache=True)
+def _across(matrix: Array, nodes: Array, along: Array, others: Array, toward: Array) -> Array:
+    result = np.empty((len(nodes), len(others)))
+    for j in range(len(others)):
+        n, x, y, z = 3 * others[j], toward[j, 0], toward[j, 1], toward[j, 2]
+        first, second, third = matrix[n], matrix[n + 1], matrix[n + 2]
+        for i in range(len(nodes)):
+            total = 0.0
+            for axis in range(3):
+                c = 3 * nodes[i] + axis
+                total += along[i, axis] * (x * first[c] + y * second[c] + z * third[c])
+            result[i, j] = total
     return result
 
 

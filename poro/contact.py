@@ -11,12 +11,13 @@ from enum import Enum
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import get_lapack_funcs, solve, solve_triangular
+from scipy.linalg import solve
 
 from poro.compliance import Compliance
 from poro.curvature import Springs, group_springs
 from poro.levelset import LevelSet
 from poro.mesh.tetmesh import Array
+from poro.saddle import saddle
 
 GAP_TOLERANCE_MM = 1e-9
 QUICK_STEPS = 10  # linearizations in which the active set is exchanged once, as in a semismooth Newton method
@@ -53,6 +54,15 @@ class Obstacle:
 
 
 @dataclass(frozen=True)
+class Guess:
+    """Where to start from: u (nc, 3) mm, force (nc,) kPa mm2 along the gap's gradient, active (nc,) bool."""
+
+    u: Array
+    force: Array
+    active: Array
+
+
+@dataclass(frozen=True)
 class ContactState:
     """Solution of the contact problem on nc nodes.
 
@@ -77,7 +87,7 @@ def settle(
     obstacle: Obstacle,
     free: Array,
     travel_mm: float,
-    start: ContactState | None = None,
+    start: Guess | ContactState | None = None,
     tolerance_mm: float = 1e-3,
     max_steps: int = 30,
 ) -> ContactState:
@@ -140,26 +150,16 @@ class Linearized:
 
         Factored in the compliance's own precision and, where that is single, refined once.
         """
-        own = self.compliance.matrix.dtype
-        (factorize,) = get_lapack_funcs(("potrf",), dtype=own)
-        upper, failed = factorize(matrix.T.astype(own, copy=False), clean=0)
-        if failed:
-            raise ValueError(f"contact nodes {failed - 1} and an earlier one move alike; the compliance is singular")
-        half = solve_triangular(upper, coupling.astype(own, copy=False), trans=1, check_finite=False)
-        schur = self.springs.matrix - half.T @ half
-
-        def forces(gap: Array, slack: Array) -> tuple[Array, Array]:
-            y = solve_triangular(upper, gap.astype(own, copy=False), trans=1, check_finite=False)
-            pull = solve(schur, half.T @ y - slack) if len(slack) else slack
-            back = solve_triangular(upper, y + half @ pull, check_finite=False)
-            return -np.asarray(back, float), np.asarray(pull, float)
-
-        push, pull = forces(offset, self.slack)
+        own, count = self.compliance.matrix.dtype, len(offset)
+        factor = saddle(matrix, coupling, self.springs.matrix, own)
+        left = np.concatenate([offset, self.slack])
+        forces = -factor.solve(left[:, None])[:, 0]
         if own == np.float32:
-            left = offset + matrix @ push + coupling @ pull
-            more, stronger = forces(left, self.slack + coupling.T @ push + self.springs.matrix @ pull)
-            push, pull = push + more, pull + stronger
-        return push, pull
+            push, pull = forces[:count], forces[count:]
+            left[:count] += matrix @ push + coupling @ pull
+            left[count:] += coupling.T @ push + self.springs.matrix @ pull
+            forces = forces - factor.solve(left[:, None])[:, 0]
+        return forces[:count], forces[count:]
 
     def displacement(self, pool: Array, force: Array, pull: Array) -> Array:
         """Displacements (nc, 3) under normal forces (k,) at nodes `pool` and the springs' forces (r,)."""

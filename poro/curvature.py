@@ -37,13 +37,21 @@ class Springs:
 
     def motion(self, force: Array) -> Array:
         """Displacements (nc, 3) under the springs' forces (r,)."""
-        share, label = self.groups.share, self.groups.label
+        label = self.groups.label
         if not len(force):
             return np.zeros((len(label), 3))
-        pull = np.zeros((len(share), 3))
-        np.add.at(pull, self.which, self.along * force[:, None])
+        pull = self._pull(force)
         flat = self.groups.motion.reshape(3 * len(label), -1) @ pull.ravel().astype(self.groups.motion.dtype)
         return flat.astype(float).reshape(-1, 3)
+
+    def spread(self, force: Array) -> Array:
+        """The springs' forces (r,) as forces (nc, 3) on the nodes."""
+        return (self._pull(force) * self.groups.share[:, None])[self.groups.label]
+
+    def _pull(self, force: Array) -> Array:
+        pull = np.zeros((len(self.groups.share), 3))
+        np.add.at(pull, self.which, self.along * force[:, None])
+        return pull
 
 
 def group_springs(compliance: Compliance, points: Array, force: Array, hessian: Array) -> Springs:
@@ -77,13 +85,13 @@ def _among(mean: Array, which: Array, along: Array) -> Array:
 
 @njit(cache=True)
 def _along_normals(motion: Array, nodes: Array, normal: Array, which: Array, along: Array) -> Array:
-    result = np.empty((len(nodes), len(which)))
+    result, row = np.empty((len(nodes), len(which))), np.empty(motion.shape[2:])
     for k in range(len(nodes)):
         m, n = motion[nodes[k]], normal[k]
-        for r in range(len(which)):
-            total = 0.0
+        for g in range(len(row)):
             for b in range(3):
-                g = which[r]
-                total += along[r, b] * (n[0] * m[0, g, b] + n[1] * m[1, g, b] + n[2] * m[2, g, b])
-            result[k, r] = total
+                row[g, b] = n[0] * m[0, g, b] + n[1] * m[1, g, b] + n[2] * m[2, g, b]
+        for r in range(len(which)):
+            g = which[r]
+            result[k, r] = along[r, 0] * row[g, 0] + along[r, 1] * row[g, 1] + along[r, 2] * row[g, 2]
     return result

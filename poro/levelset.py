@@ -38,45 +38,59 @@ def level_set(surface: TriSurface, step_mm: float, smooth_mm: float, margin_mm: 
 
 
 @njit(cache=True)
-def _weights(t: float, step: float) -> tuple[Array, Array, Array]:
-    """Cubic B-spline weights of four neighbours and their first two derivatives."""
-    w, d, s = np.empty(4), np.empty(4), np.empty(4)
+def _weights(t: float, step: float, into: Array) -> None:
+    """Cubic B-spline weights of four neighbours and their first two derivatives, written to (3, 4)."""
     r = 1 - t
+    w, d, s = into[0], into[1], into[2]
     w[0], w[1], w[2], w[3] = r**3 / 6, (4 - 6 * t * t + 3 * t**3) / 6, (4 - 6 * r * r + 3 * r**3) / 6, t**3 / 6
-    d[0], d[1], d[2], d[3] = -r * r / 2, (3 * t * t - 4 * t) / 2, -(3 * r * r - 4 * r) / 2, t * t / 2
-    s[0], s[1], s[2], s[3] = r, 3 * t - 2, 3 * r - 2, t
-    return w, d / step, s / step**2
+    d[0], d[1] = -r * r / 2 / step, (3 * t * t - 4 * t) / 2 / step
+    d[2], d[3] = -(3 * r * r - 4 * r) / 2 / step, t * t / 2 / step
+    s[0], s[1], s[2], s[3] = r / step**2, (3 * t - 2) / step**2, (3 * r - 2) / step**2, t / step**2
 
 
 @njit(cache=True)
 def _evaluate(c: Array, ijk: Array, step: float) -> tuple[Array, Array, Array]:
-    value, gradient, hessian = np.zeros(len(ijk)), np.zeros((len(ijk), 3)), np.zeros((len(ijk), 3, 3))
+    value, gradient, hessian = np.empty(len(ijk)), np.empty((len(ijk), 3)), np.empty((len(ijk), 3, 3))
+    wx, wy, wz = np.empty((3, 4)), np.empty((3, 4)), np.empty((3, 4))
     for q in range(len(ijk)):
         # Beyond the grid the surface is far away: the border's distance is all that contact needs.
         x = min(max(ijk[q, 0], 1.0), c.shape[0] - 2.001)
         y = min(max(ijk[q, 1], 1.0), c.shape[1] - 2.001)
         z = min(max(ijk[q, 2], 1.0), c.shape[2] - 2.001)
         i, j, k = int(x), int(y), int(z)
-        wx, dx, sx = _weights(x - i, step)
-        wy, dy, sy = _weights(y - j, step)
-        wz, dz, sz = _weights(z - k, step)
+        _weights(x - i, step, wx)
+        _weights(y - j, step, wy)
+        _weights(z - k, step, wz)
+        v = gx = gy = gz = hxx = hyy = hzz = hxy = hxz = hyz = 0.0
         for a in range(4):
+            f = fy = fz = fyy = fzz = fyz = 0.0
             for b in range(4):
-                along, slope, bend = 0.0, 0.0, 0.0
+                line = c[i - 1 + a, j - 1 + b]
+                along = slope = bend = 0.0
                 for e in range(4):
-                    f = c[i - 1 + a, j - 1 + b, k - 1 + e]
-                    along += f * wz[e]
-                    slope += f * dz[e]
-                    bend += f * sz[e]
-                value[q] += wx[a] * wy[b] * along
-                gradient[q, 0] += dx[a] * wy[b] * along
-                gradient[q, 1] += wx[a] * dy[b] * along
-                gradient[q, 2] += wx[a] * wy[b] * slope
-                hessian[q, 0, 0] += sx[a] * wy[b] * along
-                hessian[q, 1, 1] += wx[a] * sy[b] * along
-                hessian[q, 2, 2] += wx[a] * wy[b] * bend
-                hessian[q, 0, 1] += dx[a] * dy[b] * along
-                hessian[q, 0, 2] += dx[a] * wy[b] * slope
-                hessian[q, 1, 2] += wx[a] * dy[b] * slope
-        hessian[q, 1, 0], hessian[q, 2, 0], hessian[q, 2, 1] = hessian[q, 0, 1], hessian[q, 0, 2], hessian[q, 1, 2]
+                    along += line[k - 1 + e] * wz[0, e]
+                    slope += line[k - 1 + e] * wz[1, e]
+                    bend += line[k - 1 + e] * wz[2, e]
+                f += wy[0, b] * along
+                fy += wy[1, b] * along
+                fz += wy[0, b] * slope
+                fyy += wy[2, b] * along
+                fyz += wy[1, b] * slope
+                fzz += wy[0, b] * bend
+            v += wx[0, a] * f
+            gx += wx[1, a] * f
+            gy += wx[0, a] * fy
+            gz += wx[0, a] * fz
+            hxx += wx[2, a] * f
+            hyy += wx[0, a] * fyy
+            hzz += wx[0, a] * fzz
+            hxy += wx[1, a] * fy
+            hxz += wx[1, a] * fz
+            hyz += wx[0, a] * fyz
+        value[q] = v
+        gradient[q, 0], gradient[q, 1], gradient[q, 2] = gx, gy, gz
+        hessian[q, 0, 0], hessian[q, 1, 1], hessian[q, 2, 2] = hxx, hyy, hzz
+        hessian[q, 0, 1] = hessian[q, 1, 0] = hxy
+        hessian[q, 0, 2] = hessian[q, 2, 0] = hxz
+        hessian[q, 1, 2] = hessian[q, 2, 1] = hyz
     return value, gradient, hessian

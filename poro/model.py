@@ -15,6 +15,7 @@ from poro.compliance import Compliance
 from poro.contact import ContactState, ContactStatus, Obstacle, contact_sensitivity, settle
 from poro.flow import Flow
 from poro.levelset import LevelSet, level_set
+from poro.lockstep import interpolated, settle_many
 from poro.mesh.patches import patches, principal_axis
 from poro.mesh.tetmesh import Array, TetMesh, signed_volumes
 from poro.modes import LoadMode
@@ -25,6 +26,8 @@ from poro.tissue import GRAVITY_KPA_PER_MM, Tissue
 KAPPA_B_BOUNDS = (1e-14, 1e-4)
 PHI_BOUNDS = (0.0, 0.93)
 DIAPHRAGM_BOUNDS_MM = (0.0, 40.0)
+WAVE_GROWTH = 5  # parameter values solved together for each one that is solved already
+LARGEST_WAVE = 48  # more would only cost memory: 3 MB each at 1700 contact nodes
 
 
 @dataclass(frozen=True)
@@ -180,27 +183,57 @@ def solve(system: PoroSystem, theta: Theta, start: PoroState | None = None, tole
 
 
 def solve_many(system: PoroSystem, thetas: Sequence[Theta], tolerance_mm: float = 1e-3) -> list[PoroState]:
-    """Deflated lungs at many parameter values, each started from the nearest one that is solved already."""
+    """Deflated lungs at many parameter values, equal to those of `solve` within the tolerance.
+
+    Solved in waves, each of which starts between the loads of those before.
+    """
+    if not thetas:
+        return []
     system.suction.learn(theta.kappa_b for theta in thetas)
-    places = np.array([[np.log10(max(t.kappa_b, KAPPA_B_BOUNDS[0])), 10 * t.phi, t.d_diaph_mm / 5] for t in thetas])
-    loads: list[tuple[Array, Array]] = [without_wall(system, theta) for theta in thetas]
+    unstopped = [without_wall(system, theta) for theta in thetas]
+    places = _load_amounts(system, thetas, [p for p, _ in unstopped])
+    order = _spread_order(places)
     contacts: dict[int, ContactState] = {}
-    far = np.linalg.norm(places - places.mean(axis=0), axis=1)
-    nearest = np.full(len(thetas), -1)
+    k = order[0]
+    contacts[k] = _settled(system, thetas[k], unstopped[k][1], None, tolerance_mm)
     while len(contacts) < len(thetas):
-        k = int(np.argmin(far))
-        before = contacts.get(int(nearest[k]))
-        contacts[k] = _settled(system, thetas[k], loads[k][1], before, tolerance_mm)
-        away = np.linalg.norm(places - places[k], axis=1)
-        closer = (away < far) | (nearest < 0)
-        nearest[closer], far[closer] = k, away[closer]
-        far[list(contacts)] = np.inf
+        known = order[: len(contacts)]
+        wave = order[len(known) :][: min(WAVE_GROWTH * len(known), LARGEST_WAVE)]
+        states = [contacts[k] for k in known]
+        starts = interpolated(places[known], states, places[wave])
+        free = np.stack([unstopped[k][1][system.contact_nodes] for k in wave])
+        travel = [thetas[k].d_diaph_mm for k in wave]
+        found = settle_many(system.compliance, system.obstacle, free, travel, starts, tolerance_mm)
+        for k, contact in zip(wave, found, strict=True):
+            stopped = contact.status is ContactStatus.STOPPED
+            contacts[k] = _settled(system, thetas[k], unstopped[k][1], None, tolerance_mm) if stopped else contact
     forces = np.stack([_pushed(system, contacts[k]) for k in range(len(thetas))], axis=2)
     pushed = system.solid.solve(forces)
     return [
         _state(system, theta, p, free + pushed[:, :, k], contacts[k])
-        for k, (theta, (p, free)) in enumerate(zip(thetas, loads, strict=True))
+        for k, (theta, (p, free)) in enumerate(zip(thetas, unstopped, strict=True))
     ]
+
+
+def _load_amounts(system: PoroSystem, thetas: Sequence[Theta], pressures: Sequence[Array]) -> Array:
+    """Loads (b, d), each in standard deviations: what the lung without wall answers to nearly linearly."""
+    drops = [float(system.tissue.pleural_kpa - p.mean()) for p in pressures]
+    loads = np.array([[p, t.phi, t.d_diaph_mm, *t.modes] for p, t in zip(drops, thetas, strict=True)])
+    loads = loads - loads.mean(axis=0)
+    spread = loads.std(axis=0)
+    varied = spread > 1e-9 * np.abs(loads).max(axis=0, initial=1e-30)
+    return np.asarray(loads[:, varied] / spread[varied])
+
+
+def _spread_order(places: Array) -> list[int]:
+    """Order of places (b, d) from the middle on, each the farthest from those before it."""
+    order = [int(np.argmin(np.linalg.norm(places, axis=1)))]
+    away = np.linalg.norm(places - places[order[0]], axis=1)
+    while len(order) < len(places):
+        away[order] = -1
+        order.append(int(np.argmax(away)))
+        away = np.minimum(away, np.linalg.norm(places - places[order[-1]], axis=1))
+    return order
 
 
 def without_wall(system: PoroSystem, theta: Theta) -> tuple[Array, Array]:
