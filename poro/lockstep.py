@@ -11,10 +11,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from poro.anderson import Anderson
 from poro.compliance import Compliance
 from poro.contact import (
     GAP_TOLERANCE_MM,
     MAX_MOVE_MM,
+    MIX_MM,
     QUICK_STEPS,
     ContactState,
     ContactStatus,
@@ -42,6 +44,7 @@ class _Run:
     force: Array
     active: Array
     moves: list[float] = field(default_factory=list)
+    anderson: Anderson = field(default_factory=Anderson)
     kept: KeptWall | None = None
     settled: bool = False
 
@@ -58,10 +61,14 @@ class _Run:
         force = np.where(self.active, self.force + change, 0)
         ahead = gap + np.einsum("nd,nd->n", gradient, step)
         wrong = (self.active & (force < 0)) | (~self.active & (ahead < -GAP_TOLERANCE_MM))
-        self.u = self.u + min(1.0, MAX_MOVE_MM / max(self.moves[-1], 1e-30)) * step
         self.settled = self.moves[-1] < tolerance_mm and not wrong.any()
-        self.active = self.active ^ wrong
-        self.force = np.where(self.active, force, 0)
+        force = np.where(self.active & ~wrong, force, 0)
+        if self.settled or (self.moves[-1] < MIX_MM and not wrong.any()):
+            self.u, self.force = (target, force) if self.settled else self.anderson.mix(step, target, force)
+            return
+        self.anderson.forget()
+        self.u = self.u + min(1.0, MAX_MOVE_MM / max(self.moves[-1], 1e-30)) * step
+        self.active, self.force = self.active ^ wrong, force
 
 
 def settle_many(

@@ -101,7 +101,8 @@ class Observer:
         """Signed distance of every target point to the deformed surface, exact and so with an exact derivative.
 
         Where the target's normal and the surface's disagree the point is taken to belong to another side and loses
-        weight.
+        weight. The surface's is taken from its nodes: most nearest points lie on an edge, where the faces' own normals
+        would leave the weight to rounding.
         """
         boundary = self.mesh.boundary
         moved = boundary.moved(boundary.points + u[boundary.nodes])
@@ -112,7 +113,9 @@ class Observer:
         far = length > 1e-6
         normal = np.where(far, np.sign(near.distance)[:, None] * offset / np.where(far, length, 1), face)
         share = -near.barycentric[:, :, None] * normal[:, None]
-        agree = np.clip(np.einsum("td,td->t", face, self.target.normals), 0, 1)
+        smooth = np.einsum("tc,tcd->td", near.barycentric, moved.node_normals[moved.triangles[near.triangle]])
+        smooth /= np.maximum(np.linalg.norm(smooth, axis=1), 1e-12)[:, None]
+        agree = np.clip(np.einsum("td,td->t", smooth, self.target.normals), 0, 1)
         nodes = boundary.nodes[boundary.triangles[near.triangle]]
         every = np.arange(len(length))
         return Residuals(near.distance, nodes, share, every, self.target.weights * agree, np.ones(len(every), bool))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -9,7 +10,18 @@ import pytest
 from numpy.testing import assert_allclose
 from shapes import ellipsoid
 
-from poro.fit import REACH, Fit, FitSettings, FitStatus, ellipsoid95, fit
+from poro.fit import (
+    REACH,
+    Fit,
+    FitSettings,
+    FitStatus,
+    _normal_equations,
+    _Problem,
+    _worth,
+    ellipsoid95,
+    fit,
+)
+from poro.identify import THETA_NAMES, identifiability
 from poro.mesh import interpolate, locate
 from poro.mesh.tetmesh import Array
 from poro.model import PoroState, PoroStatus, PoroSystem, Theta, assemble, sensitivity, solve
@@ -80,6 +92,17 @@ def test_residuals_have_exact_derivatives(system: PoroSystem, truth: PoroState, 
         ahead, behind = (observer.residuals(truth.u + s * h * du[:, :, k]).value for s in (1, -1))
         smooth = np.abs(rows.value) > 1e-2
         assert_allclose(rows.derivative(du)[smooth, k], ((ahead - behind) / (2 * h))[smooth], atol=1e-4)
+
+
+def test_weights_do_not_hang_on_rounding(system: PoroSystem, truth: PoroState) -> None:
+    """Points outside a bulging surface lie nearest to its edges and corners, which belong to several faces."""
+    observer = Observer(system.mesh, _target(system, solve(system, Theta(1e-9, 0.85))))
+    rng = np.random.default_rng(9)
+    before = observer.residuals(truth.u)
+    for _ in range(3):
+        after = observer.residuals(truth.u + 1e-11 * rng.normal(size=truth.u.shape))
+        assert_allclose(after.value, before.value, atol=1e-8)
+        assert_allclose(after.weight, before.weight, atol=1e-7)
 
 
 @pytest.fixture(scope="module")
@@ -159,6 +182,54 @@ def test_mode_sensitivity_equals_finite_differences(system: PoroSystem) -> None:
         ahead, behind = (solve(wide, Theta.of(x + s * step), state) for s in (1, -1))
         difference = (ahead.u - behind.u) / 2e-4
         assert_allclose(du[:, :, k], difference, atol=2e-3 * np.abs(difference).max())
+
+
+def test_slope_is_the_gradient_of_the_robust_cost_and_its_priors_at_frozen_weights(
+    system: PoroSystem, truth: PoroState
+) -> None:
+    modes = hilum_modes(system.mesh, system.hilum)[:1]
+    wide = assemble(system.mesh, TISSUE, GRAVITY, system.hilum, system.hilum_displacement, modes)
+    target, settings = _target(system, truth, inner=12), FitSettings(kappa_decades=0.7)
+    problem = _Problem(wide, Observer(wide.mesh, target), settings, _worth(target, settings.correlation_mm))
+    x = np.array([-7.4, 0.75, 3.0, 1.5])
+
+    state = solve(wide, Theta.of(x), None, 1e-9)
+    rows = problem.observer.residuals(state.u)
+    _, slope = _normal_equations(problem, rows, sensitivity(wide, state), x)
+    for k, h in enumerate((1e-4, 1e-4, 1e-3, 1e-3)):
+        costs = []
+        for theta in (x + h * np.eye(4)[k], x - h * np.eye(4)[k]):
+            moved = problem.observer.residuals(solve(wide, Theta.of(theta), state, 1e-9).u)
+            costs.append(problem.cost(moved, problem.whiten(rows), theta))
+        difference = (costs[0] - costs[1]) / (2 * h)
+        assert slope[k] == pytest.approx(difference, rel=5e-3, abs=1e-3 * np.abs(slope).max())
+
+
+def test_a_start_where_no_suction_is_felt_comes_back_through_the_prior(system: PoroSystem, truth: PoroState) -> None:
+    """At 1e-13 the pressure drop is 1e-4 of what it can be: without a prior nothing pulls the fit away from there."""
+    target, start = _target(system, truth), ((1e-13, 0.82, 6.0),)
+    lost = fit(system, target, FitSettings(starts=start, kappa_decades=np.inf, free=(True, False, False)))
+    found = fit(system, target, FitSettings(starts=start, free=(True, False, False)))
+    assert lost.theta.kappa_b < 1e-12
+    assert np.log10(found.theta.kappa_b) == pytest.approx(np.log10(TRUE.kappa_b), abs=0.05)
+
+
+def test_identifiability_names_what_is_held_and_what_ended_at_a_bound(system: PoroSystem, truth: PoroState) -> None:
+    target = _target(system, truth, inner=15)
+    known = identifiability(fit(system, target, FitSettings(starts=((2e-8, 0.82, 6.0),))), system)
+    assert known.names == THETA_NAMES
+    assert known.at_bound == ()
+    assert_allclose(np.diag(known.correlation), 1, atol=1e-12)
+    assert (np.diff(known.singular) <= 0).all()
+    # The information is that of the covariance: along the valley its inverse is the variance in units of the reach.
+    assert np.linalg.norm(known.valley) == pytest.approx(1)
+    information = np.linalg.inv(known.correlation * np.outer(known.sigma, known.sigma)) * np.outer(REACH, REACH)
+    assert known.valley @ information @ known.valley == pytest.approx(known.singular[-1] ** 2)
+    still = fit(system, target, FitSettings(starts=((2e-8, 0.93, 0.0),), free=(True, False, True), max_steps=1))
+    assert identifiability(still, system).names == ("log10 kappa_b", "d_diaph_mm")
+    down = _target(system, solve(system, Theta(2e-8, 0.82, 0.0)), inner=15)
+    ended = fit(system, replace(down, points=down.points - [0, 0, 4.0]), FitSettings(starts=((2e-8, 0.82, 3.0),)))
+    assert identifiability(ended, system).at_bound == ("d_diaph_mm",)
 
 
 def test_empty_targets_and_wrong_gravity_are_refused(system: PoroSystem) -> None:

@@ -205,8 +205,9 @@ def fit_settings(settings: Settings, modes: int = 0) -> FitSettings:
     """The fit's own settings, from those of a run."""
     plain = settings.model.cost == "plain"
     free = (True, True, settings.model.diaphragm, *modes * (True,))
-    sigma = settings.keypoints.sigma_mm
-    return FitSettings(plain=plain, free=free, max_steps=settings.model.max_steps, keypoint_sigma_mm=sigma)
+    sigma, steps = settings.keypoints.sigma_mm, settings.model.max_steps
+    decades = np.inf if plain else FitSettings.kappa_decades
+    return FitSettings(plain=plain, free=free, max_steps=steps, keypoint_sigma_mm=sigma, kappa_decades=decades)
 
 
 def _with(target: Target, pairs: Pairs) -> Target:

@@ -211,5 +211,8 @@ def _note(pose: ChangeOfPose, collapse: Collapse, stages: Stages) -> None:
     unsettled = collapse.fit.status
     if unsettled is not FitStatus.CONVERGED:
         stages.warn(f"The fit ended early: {unsettled.value}.")
+    held = collapse.known.at_bound
+    if held:
+        stages.warn(f"The fit ended at a bound of {' and '.join(held)}: the model makes up there for what it lacks.")
     if np.any(collapse.fit.state.conflicts):
         stages.warn(f"{collapse.fit.state.conflicts} nodes were pushed behind the cage by the diaphragm.")

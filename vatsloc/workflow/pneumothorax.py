@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from poro.fit import Fit
+from poro.identify import Identifiability, identifiability
 from poro.mesh import TetMesh, TriSurface, interpolate, locate
 from poro.model import PoroSystem
 from registration.rigid import RigidTransform
@@ -62,6 +63,11 @@ class Collapse:
     def fit(self) -> Fit:
         """The model's parameters."""
         return self.model.fit
+
+    @property
+    def known(self) -> Identifiability:
+        """What the observations tell of each parameter."""
+        return identifiability(self.fit, self.system)
 
     def on_lung(self, nodal: Array) -> Array:
         """A nodal field of the model's mesh on the nodes of the lung's."""
