@@ -10,11 +10,12 @@ import numpy as np
 from scipy import ndimage
 
 from poro.mesh import TetMesh, stuff
-from poro.mesh.tetmesh import Array, TriSurface
+from poro.mesh.tetmesh import Array
 from registration.volume import Mask
 from vatsloc.errors import CaseError, InputRefused
 from vatsloc.formats.images import read_mask
 from vatsloc.imaging.lungs import Side, split_lungs
+from vatsloc.study.breathing import Lung
 
 INSPIRATION, EXPIRATION, LANDMARKS = "lungs_inspiration.nii.gz", "lungs_expiration.nii.gz", "landmarks_ras_mm.csv"
 _COLUMNS = ["insp_x", "insp_y", "insp_z", "exp_x", "exp_y", "exp_z"]
@@ -35,14 +36,11 @@ class Breath:
 
 
 @dataclass(frozen=True)
-class Motion:
-    """One lung to be moved from one breath-hold into the other: from its mesh onto a surface; landmarks (k, 3) mm."""
+class Marks:
+    """Landmarks of one lung, (k, 3) mm each, row by row the same points. They score, and are shown to no prediction."""
 
-    side: Side
-    mesh: TetMesh
-    onto: TriSurface
-    landmarks: Array
-    truth: Array
+    inspired: Array
+    expired: Array
 
 
 @dataclass(frozen=True)
@@ -53,20 +51,35 @@ class Person:
     inspiration: Breath
     expiration: Breath
 
-    def motions(self, deflate: bool, edge_mm: float) -> list[Motion]:
-        """Both lungs' motions, from inspiration to expiration when `deflate`, else back; `edge_mm` of the meshes."""
-        start, end = (self.inspiration, self.expiration) if deflate else (self.expiration, self.inspiration)
-        sides = np.array(start.sides)
+    def lungs(self, edge_mm: float) -> list[Lung]:
+        """Both lungs at both breath-holds, as meshes of edge `edge_mm`, made of the masks alone."""
         return [
-            Motion(
-                side,
-                _mesh(start.lungs[side], edge_mm),
-                _mesh(end.lungs[side], edge_mm).boundary,
-                start.landmarks[sides == side],
-                end.landmarks[sides == side],
-            )
-            for side in start.lungs
+            Lung(side, _mesh(inspired, edge_mm), _mesh(to_the_back(self.expiration.lungs[side], inspired), edge_mm))
+            for side, inspired in self.inspiration.lungs.items()
         ]
+
+    def marks(self, side: Side) -> Marks:
+        """Landmarks of the lung on `side`, by where they lie at inspiration."""
+        here = np.array(self.inspiration.sides) == side
+        return Marks(self.inspiration.landmarks[here], self.expiration.landmarks[here])
+
+
+def to_the_back(expired: Mask, inspired: Mask) -> Mask:
+    """Expired lung filled up to the back wall of the inspired one (same grid, along the patient's axes).
+
+    On a patient's back, spine and back ribs lie still; but what lies lowest may grow so dense in expiration that a
+    threshold leaves it out of the mask. Raises InputRefused for masks of different shapes.
+    """
+    if expired.inside.shape != inspired.inside.shape:
+        raise InputRefused(
+            f"The masks have {inspired.inside.shape} and {expired.inside.shape} voxels; give both on one grid."
+        )
+    step = -1 if expired.ras_from_ijk[1, 1] < 0 else 1
+    lung, full = expired.inside[:, ::step], inspired.inside[:, ::step]
+    # Running from back to front: behind the expired lung, and not behind the inspired one.
+    behind = ~np.logical_or.accumulate(lung, axis=1) & lung.any(axis=1, keepdims=True)
+    filled = lung | (behind & np.logical_or.accumulate(full, axis=1))
+    return Mask(filled[:, ::step], expired.ras_from_ijk)
 
 
 def read_person(folder: Path) -> Person:
