@@ -359,13 +359,20 @@ def bench_real_command(
         list[Path],
         typer.Argument(metavar="DIR...", help="Folders with lung masks at two breath-holds and landmark pairs."),
     ],
+    picture: Annotated[Path | None, typer.Option(help="PNG of the errors as arrows; needs the extra `report`.")] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Real lungs: move one breath-hold into the other by shape alone; errors at landmarks that were only scored."""
     from vatsloc.study.bench_real import bench_real, table
+    from vatsloc.study.chart_draw import require_matplotlib
+    from vatsloc.study.real_draw import draw_real
 
+    if picture is not None:
+        require_matplotlib()
     result = bench_real(people, say=say)
     say(table(result))
+    if picture is not None:
+        draw_real(people, picture)
     if as_json:
         show(result)
 

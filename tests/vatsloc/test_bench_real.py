@@ -8,6 +8,7 @@ from pathlib import Path
 import nibabel as nib
 import numpy as np
 import pytest
+from matplotlib.axes import Axes
 from numpy.testing import assert_allclose
 
 from poro.mesh import TetMesh
@@ -15,6 +16,7 @@ from poro.mesh.tetmesh import Array
 from registration.volume import Mask
 from vatsloc.errors import CaseError, InputRefused
 from vatsloc.study import bench_real as bench
+from vatsloc.study import real_draw
 from vatsloc.study.affine import affine_to_points, affine_to_shape
 from vatsloc.study.breathing import Lung
 from vatsloc.study.breaths import EXPIRATION, INSPIRATION, LANDMARKS, Marks, read_person, to_the_back
@@ -136,6 +138,20 @@ def test_errors_are_those_of_the_map_and_of_its_inverse() -> None:
     out, back = bench.errors(Lung("right", mesh, mesh), moved, known)
     assert_allclose(out, 5.0, atol=1e-9)
     assert_allclose(back, np.linalg.norm(np.linalg.inv(SQUEEZE) @ [0.0, 3.0, 4.0]), atol=1e-9)
+
+
+def test_errors_are_drawn_for_each_lung_and_view(
+    person_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn: list[tuple[Array, Array]] = []
+    monkeypatch.setattr(real_draw, "ROWS", dict.fromkeys(bench.ROWS, bench.ROWS[bench.UNMOVED]))
+    monkeypatch.setattr(Axes, "quiver", lambda self, x, y, u, v, **_: drawn.append((x + u, y + v)))
+    real_draw.draw_real([person_folder], tmp_path / "errors.png")
+    assert (tmp_path / "errors.png").read_bytes().startswith(b"\x89PNG")
+    assert len(drawn) == 8
+    truth = read_person(person_folder).marks("left").expired
+    assert_allclose(drawn[0], truth[:, 1:].T)
+    assert_allclose(drawn[1], truth[:, ::2].T)
 
 
 def test_what_lies_behind_an_expired_lung_is_filled_up_to_the_back_wall() -> None:
