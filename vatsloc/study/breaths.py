@@ -11,6 +11,7 @@ from scipy import ndimage
 
 from poro.mesh import TetMesh, stuff
 from poro.mesh.tetmesh import Array
+from registration.resample import resample_mask
 from registration.volume import Mask
 from vatsloc.errors import CaseError, InputRefused
 from vatsloc.formats.images import read_mask
@@ -65,15 +66,12 @@ class Person:
 
 
 def to_the_back(expired: Mask, inspired: Mask) -> Mask:
-    """Expired lung filled up to the back wall of the inspired one (same grid, along the patient's axes).
+    """Expired lung filled up to the back wall of the inspired one; voxels along the patient's axes.
 
     On a patient's back, spine and back ribs lie still; but what lies lowest may grow so dense in expiration that a
-    threshold leaves it out of the mask. Raises InputRefused for masks of different shapes.
+    threshold leaves it out of the mask.
     """
-    if expired.inside.shape != inspired.inside.shape:
-        raise InputRefused(
-            f"The masks have {inspired.inside.shape} and {expired.inside.shape} voxels; give both on one grid."
-        )
+    inspired = resample_mask(inspired, expired.grid)
     step = -1 if expired.ras_from_ijk[1, 1] < 0 else 1
     lung, full = expired.inside[:, ::step], inspired.inside[:, ::step]
     # Running from back to front: behind the expired lung, and not behind the inspired one.
