@@ -23,6 +23,7 @@ from poro.saddle import saddle
 GAP_TOLERANCE_MM = 1e-9
 QUICK_STEPS = 10  # linearizations in which the active set is exchanged once, as in a semismooth Newton method
 MAX_PIVOTS = 80  # of later ones, and of the first, which knows no active set
+ALL_PIVOTS = 200  # of all linearizations; settled lungs take 5 to 30, lost ones would go on for thousands
 MIX_MM = 1.0  # below it what the springs miss of the wall's curvature makes one step like the other, and is mixed away
 REFINEMENTS = 8  # of a factor in single precision, before double precision has to do
 MAX_MOVE_MM = 20.0  # largest step over which a linearized wall is believed
@@ -105,7 +106,7 @@ def settle(
     moves: list[float] = []
     pivots, pivoted, status = 0, False, ContactStatus.STOPPED
     anderson = Anderson()
-    while len(moves) < max_steps:
+    while len(moves) < max_steps and pivots < ALL_PIVOTS:
         gap, gradient, hessian = obstacle.gap(u, travel_mm)
         springs = group_springs(compliance, obstacle.rest, force, hessian)
         wall = Linearized(compliance, gap, gradient, u, free, springs)

@@ -39,6 +39,8 @@ def test_random_starts_find_the_target_that_the_model_made(own: tuple[PoroSystem
     assert found["starts"] == 6
     assert 1 <= found["at the best cost"] <= 6
     assert found["farthest apart there, mm"] < 1.0
+    assert found["elsewhere, said to be settled"] <= 6 - found["at the best cost"]
+    assert found["default start over the best cost, %"] < 2.0
 
 
 def test_parameters_are_reported_with_what_holds_them(own: tuple[PoroSystem, Target]) -> None:
@@ -86,6 +88,30 @@ def test_silent_failures_are_counted() -> None:
         {"case": "a", "disturbed": "y", "landmarks_mm": 12.0, "nodule_mm": 1.0, "flagged": "surface", "silent": False},
     ]
     assert "**1 of 2**" in page({"disturbed": rows, "starts": [], "identifiability": []})
+
+
+def test_the_picture_shows_every_run_that_answered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("matplotlib")
+    from matplotlib.axes import Axes
+
+    from vatsloc.study.stability_fit_draw import draw_disturbed
+
+    drawn: list[tuple[list[float], str]] = []
+    plain = Axes.scatter
+
+    def noted(self: Axes, x: list[float], y: list[float], **style: Any) -> Any:
+        drawn.append((list(x), style["facecolors"]))
+        return plain(self, x, y, **style)
+
+    monkeypatch.setattr(Axes, "scatter", noted)
+    rows = [
+        {"case": "a", "disturbed": "x", "landmarks_mm": 2.0, "flagged": ""},
+        {"case": "a", "disturbed": "y", "landmarks_mm": 12.0, "flagged": "surface"},
+        {"case": "a", "disturbed": "z", "landmarks_mm": "", "flagged": "InputRefused"},
+    ]
+    draw_disturbed(rows, 10.0, tmp_path / "disturbed.png")
+    assert drawn == [([2.0], "C0"), ([12.0], "none")]
+    assert (tmp_path / "disturbed.png").read_bytes()[:4] == b"\x89PNG"
 
 
 def test_a_case_without_landmarks_is_refused(tmp_path: Path) -> None:
