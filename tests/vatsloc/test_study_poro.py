@@ -33,6 +33,10 @@ def test_getfem_gives_the_same_displacements() -> None:
     assert result["rel_diff_contact"] < 1e-3
     assert min(value["nodes in contact"] for value in result["values"]) > 20
     assert all(row["times faster"] == row["GetFEM s"] / row["ours s"] > 0 for row in result["speed"])
+    times = {row["what"]: row["times faster"] for row in result["speed"]}
+    assert result["speedup_single"] == times["wall, warm"]
+    assert result["speedup_sweep4"] == times["wall, 4 values, warm"]
+    assert result["speedup_sweep4_cold"] == times["wall, 4 values, cold"]
     json.dumps(result)
     told = bench.page({"getfem": result, "sizes": []})
     assert "| wall, warm |" in told

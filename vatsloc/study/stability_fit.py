@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from poro import identify
 from poro.fit import FitStatus, bounds, fit
 from poro.model import PoroSystem, assemble
 from poro.observations import Target
@@ -34,7 +35,6 @@ from vatsloc.workflow.stages import Say, Stages, quiet
 
 VERTEBRA_MM = 22.0
 STARTS = 50
-NAMES = ("log10 kappa_b", "phi", "d_diaph mm")
 
 
 @dataclass(frozen=True)
@@ -133,12 +133,12 @@ def identifiability(system: PoroSystem, target: Target, settings: Settings) -> l
     """
     chosen = fit_settings(settings)
     best = fit(system, target, chosen)
-    sigma = np.sqrt(np.diag(best.covariance))[:3]
-    correlation = (best.covariance / np.outer(*2 * (np.sqrt(np.diag(best.covariance)),)))[:3, :3] - np.eye(3)
-    singular = np.linalg.svd(np.linalg.inv(best.covariance[:3, :3]), compute_uv=False)
+    known = identify.identifiability(best, system)
+    others = known.correlation - np.eye(len(known.names))
     low, high = (b[:3] for b in bounds(system))
     theta, rows = best.theta.vector()[:3], []
-    for k, name in enumerate(NAMES):
+    for row, name in enumerate(known.names):
+        k = identify.THETA_NAMES.index(name)
         rises = []
         for sign in (-1, 1):
             x = theta.copy()
@@ -150,11 +150,11 @@ def identifiability(system: PoroSystem, target: Target, settings: Settings) -> l
             {
                 "parameter": name,
                 "estimate": float(theta[k]),
-                "sigma": float(sigma[k]),
-                "strongest correlation": float(correlation[k][np.argmax(np.abs(correlation[k]))]),
+                "sigma": float(known.sigma[row]),
+                "strongest correlation": float(others[row][np.argmax(np.abs(others[row]))]),
                 "cost rise below, %": rises[0],
                 "cost rise above, %": rises[1],
-                "singular value of information": float(singular[k]),
+                "singular value": float(known.singular[row]),
             }
         )
     return rows
