@@ -123,7 +123,7 @@ class _CaseRuns:
     def pose(self, variant: Variant) -> tuple[ChangeOfPose, _Cost]:
         """Phase 1 and its cost; the same one is not run again."""
         settings = variant.settings
-        left_out = settings.leave_out.first_registration_mm, settings.leave_out.unseen_share
+        left_out = settings.leave_out.first_registration_mm
         key = f"{variant.register.__name__} {settings.registration} {settings.mesh.edge_mm} {left_out}"
         if key not in self.poses:
             stages = Stages()

@@ -18,20 +18,18 @@ from vatsloc.workflow.choices import Choice
 from vatsloc.workflow.ladder import STRAIN
 from vatsloc.workflow.observe import Observed, observe
 from vatsloc.workflow.pneumothorax import RESIDUAL, Collapse, collapse
-from vatsloc.workflow.pose import EXTRAPOLATION, FIRST, ChangeOfPose, change_of_pose
+from vatsloc.workflow.pose import FIRST, ChangeOfPose, change_of_pose
 from vatsloc.workflow.prepare import Prepared, prepare
 from vatsloc.workflow.settings import settings_of
 from vatsloc.workflow.stages import Say, Stages, quiet
 
 LIMITS = {
     FIRST: "first_registration_mm",
-    EXTRAPOLATION: "unseen_share",
     STRAIN: "strained_share",
     RESIDUAL: "residual_mm",
 }
 """By part, the setting that decides on it."""
 KEEP, LEAVE = -1.0, inf
-OF_POSE = (FIRST, EXTRAPOLATION)
 
 
 @dataclass(frozen=True)
@@ -87,7 +85,7 @@ def try_choices(
     own = scene.run({}, None, None)
     tried = []
     for choice in (choice for choice in own.choices if choice.part in parts):
-        same = (None, None) if choice.part in OF_POSE else (own.pose, own.seen)
+        same = (None, None) if choice.part == FIRST else (own.pose, own.seen)
         other = scene.run({LIMITS[choice.part]: LEAVE if choice.kept else KEEP}, *same)
         tried.append(Tried(folder.resolve().name, choice, float(np.linalg.norm(other.nodule - own.nodule))))
     return tried

@@ -32,6 +32,9 @@ from vatsloc.workflow.stages import Stages
 
 RIM_MM = 4.0
 """Nodes nearer than this to the rim of what the scanner saw are left to the extrapolation."""
+SEEN, UNSEEN = 100.0, 1.0
+"""Weights of the registration at nodes that the scanner saw, and of its smooth continuation at the others. Elastic
+tissue that nothing holds there falls back towards the spine's pose: it was 3 to 12 mm off, and is 2 to 4 continued."""
 HINT_REACH_MM = 10.0
 """How far a marked vertebra may be off: less than half the distance to the next one."""
 FIRST, EXTRAPOLATION = "first registration", "extrapolation"
@@ -119,11 +122,11 @@ def change_of_pose(
         inversion = invert_at(ffd.moving_from_fixed, mesh.points, placed.points)
         settled = inversion.residual_mm < settings.gates.max_inversion_mm
         seen = _deep_inside(prepared.inflated.field.usable, inversion.points_fixed) & settled
-        points = np.where(settled[:, None], inversion.points_fixed, placed.points)
-        extension = None
-        if stages.choose(extrapolated(seen, settings.leave_out.unseen_share)):
-            nodes = np.flatnonzero(seen)
-            extension = extrapolate(placed, nodes, (points - placed.points)[nodes], Tissue())
+        points, extension = inversion.points_fixed, None
+        if stages.choose(extrapolated(seen)):
+            nodes = np.flatnonzero(settled)
+            weights = np.where(seen[nodes], SEEN, UNSEEN)
+            extension = extrapolate(placed, nodes, (points - placed.points)[nodes], Tissue(), weights)
             points = placed.points + extension.u
     return ChangeOfPose(
         rigid=rigid,
@@ -148,12 +151,10 @@ def is_far(prior: PointMap, limit_mm: float, stages: Stages, places: Keypoints |
     return stages.choose(weigh(FIRST, moved, limit_mm, seen))
 
 
-def extrapolated(seen: Array, limit: float) -> Choice:
-    """Whether the motion has to be continued to what the scanner does not see; the spline's own tail may do for a few
-    nodes.
-    """
+def extrapolated(seen: Array) -> Choice:
+    """Whether the motion has to be continued to what the scanner does not see, of nodes seen (n,) bool."""
     share = np.count_nonzero(~seen) / len(seen)
-    return weigh(EXTRAPOLATION, share, limit, f"{100 * share:.1f} % of the lung's nodes are out of view", "%")
+    return weigh(EXTRAPOLATION, share, 0.0, f"{100 * share:.1f} % of the lung's nodes are out of view", "%")
 
 
 def ffd_settings(settings: RegistrationSettings) -> FfdSettings:

@@ -242,7 +242,7 @@ def _change_of_pose(pose: ChangeOfPose) -> dict[str, Any]:
         if extended is None
         else {
             "status": extended.status.value,
-            "imposed_nodes": int(pose.seen.sum()),
+            "seen_nodes": int(pose.seen.sum()),
             "released_nodes": len(extended.released),
             "min_det": extended.det_f.min(),
         },

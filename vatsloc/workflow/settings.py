@@ -82,13 +82,12 @@ class LeaveOutSettings(_Table):
     """Up to which value, measured on the scene, a part is left out.
 
     first_registration_mm: how far 95 % of the places inside the lung moved against the spine; residual_mm: median
-    misfit of the model at places that it has not seen; unseen_share: of the lung's nodes (extrapolation);
-    strained_share: of elements beyond the range of linear strain (finite strain). -1 keeps a part whatever is seen.
+    misfit of the model at places that it has not seen; strained_share: of elements beyond the range of linear strain
+    (finite strain). -1 keeps a part whatever is seen.
     """
 
     first_registration_mm: float = Field(default=-1.0, ge=-1)
     residual_mm: float = Field(default=-1.0, ge=-1)
-    unseen_share: float = Field(default=0.0, ge=-1)
     strained_share: float = Field(default=0.001, ge=-1)
 
 
@@ -133,7 +132,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "mesh": {"edge_mm": 6.0},
         "residual": {"grid_mm": 10.0, "voxel_mm": 1.5},
     },
-    "auto": {"leave_out": {"first_registration_mm": 10.0, "residual_mm": 0.8, "unseen_share": 0.01}},
+    "auto": {"leave_out": {"first_registration_mm": 10.0, "residual_mm": 0.8}},
 }
 
 
