@@ -25,6 +25,7 @@ QUICK_STEPS = 10  # linearizations in which the active set is exchanged once, as
 MAX_PIVOTS = 80  # of later ones, and of the first, which knows no active set
 ALL_PIVOTS = 200  # of all linearizations; settled lungs take 5 to 30, lost ones would go on for thousands
 MIX_MM = 1.0  # below it what the springs miss of the wall's curvature makes one step like the other, and is mixed away
+MIX_FLIPS = 10  # nodes that may come and go meanwhile: some always do where the lung creeps along the wall
 REFINEMENTS = 8  # of a factor in single precision, before double precision has to do
 MAX_MOVE_MM = 20.0  # largest step over which a linearized wall is believed
 
@@ -119,11 +120,12 @@ def settle(
         if moves[-1] < tolerance_mm and status is not ContactStatus.STOPPED:
             u = target
             break
-        if moves[-1] > MIX_MM or (active != before).any():
+        if moves[-1] > MIX_MM or (active != before).sum() > MIX_FLIPS:
             anderson.forget()
             u = u + min(1.0, MAX_MOVE_MM / max(moves[-1], 1e-30)) * (target - u)
         else:
             u, force = anderson.mix(target - u, target, force)
+            force = np.where(active, np.maximum(force, 0), 0)
     gap, gradient, hessian = obstacle.gap(u, travel_mm)
     if moves[-1] >= tolerance_mm or status is ContactStatus.STOPPED:
         status = ContactStatus.STOPPED

@@ -248,8 +248,8 @@ def _descend(problem: _Problem, theta: Array) -> tuple[Array, PoroState, tuple[F
             continue
         gain = (cost - trial_cost) / cost
         theta, state, rows, cost = theta + step, trial_state, trial_rows, trial_cost
-        # A step that the box cut short says little of what the next one may gain.
-        if gain < problem.settings.tolerance and (np.abs(step) < 0.99 * radius * reach).all():
+        # A step that the whole box cut short says little of what the next one may gain; in a small one all steps are.
+        if gain < problem.settings.tolerance and (radius < 1 or (np.abs(step) < 0.99 * reach).all()):
             return theta, state, tuple(history), True
         radius = min(1.0, 3 * radius)
         normal, slope = _normal_equations(problem, rows, sensitivity(problem.system, state), theta)
