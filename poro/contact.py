@@ -24,8 +24,8 @@ GAP_TOLERANCE_MM = 1e-9
 QUICK_STEPS = 10  # linearizations in which the active set is exchanged once, as in a semismooth Newton method
 MAX_PIVOTS = 80  # of later ones, and of the first, which knows no active set
 ALL_PIVOTS = 200  # of all linearizations; settled lungs take 5 to 30, lost ones would go on for thousands
-MIX_MM = 1.0  # below it what the springs miss of the wall's curvature makes one step like the other, and is mixed away
-MIX_FLIPS = 10  # nodes that may come and go meanwhile: some always do where the lung creeps along the wall
+MIX_MM = 5.0  # below it what the springs miss of the wall's curvature makes one step like the other, and is mixed away
+MIX_FLIPS = 20  # nodes that may come and go meanwhile: some always do where the lung creeps along the wall
 REFINEMENTS = 8  # of a factor in single precision, before double precision has to do
 MAX_MOVE_MM = 20.0  # largest step over which a linearized wall is believed
 
