@@ -143,6 +143,14 @@ class Mask(_OnGrid):
     def _values(self) -> Array:
         return self.inside
 
+    def holds(self, points_ras: Array) -> Array:
+        """Whether points (n, 3) fall into voxels of the region, (n,) bool."""
+        ijk = np.rint(self.grid.to_ijk(points_ras)).astype(int)
+        within = np.all((ijk >= 0) & (ijk < self.inside.shape), axis=1)
+        result = np.zeros(len(ijk), dtype=bool)
+        result[within] = self.inside[tuple(ijk[within].T)]
+        return result
+
     def part(self, cut: Cut) -> Mask:
         """The voxels of three slices."""
         return Mask(self.inside[cut], self.grid.part(cut).ras_from_ijk)

@@ -88,3 +88,11 @@ def test_coarsening_and_smoothing_keep_linear_scenes_and_damp_waves_as_a_gaussia
 def test_a_displacement_field_refuses_scalars() -> None:
     with pytest.raises(ValueError, match=r"\(ni, nj, nk, 3\), got \(2, 2, 2\)"):
         DisplacementField(np.zeros((2, 2, 2)), np.eye(4))
+
+
+def test_a_mask_holds_points_in_its_voxels_and_none_beyond_the_grid() -> None:
+    inside = np.zeros((4, 3, 2), dtype=bool)
+    inside[1, 2, 1] = True
+    mask = Mask(inside, np.array([[-2.0, 0, 0, 10], [0, 3, 0, 0], [0, 0, 1, -5], [0, 0, 0, 1]]))
+    points = np.array([[8.0, 6, -4], [8.9, 7.4, -4.4], [9.1, 6, -4], [8, 6, -5], [8, 9.5, -4], [1000, 0, 0]])
+    assert mask.holds(points).tolist() == [True, True, False, False, False, False]

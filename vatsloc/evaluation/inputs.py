@@ -153,12 +153,7 @@ def depth_below_pleura(lung: TetMesh, points_ras: Array) -> Array:
 def seen_in(mask: Mask, points_ras: Array) -> Array:
     """Whether points (n, 3) fall into voxels of the mask, (n,) bool; a missing point (NaN) counts as seen."""
     missing: Array = np.any(~np.isfinite(points_ras), axis=1)
-    ijk = np.rint(mask.grid.to_ijk(np.where(missing[:, None], 0.0, points_ras))).astype(int)
-    within: Array = np.all((ijk >= 0) & (ijk < mask.inside.shape), axis=1)
-    hit = np.zeros(len(ijk), dtype=bool)
-    i, j, k = ijk[within].T
-    hit[within] = mask.inside[i, j, k]
-    return hit | missing
+    return mask.holds(np.where(missing[:, None], 0.0, points_ras)) | missing
 
 
 def _rigid(path: Path) -> RigidTransform:

@@ -94,6 +94,12 @@ def conclude(
     gates["ellipsoid"] = at_most(
         lengths[0], settings.gates.max_ellipsoid_mm, "The nodule's position is too uncertain for a wedge resection."
     )
+    for image, cbct, nodule in (
+        ("inflated", prepared.inflated, nodule_inf),
+        ("deflated", prepared.deflated, nodule_def),
+    ):
+        if not cbct.field.usable.holds(nodule[None])[0]:
+            stages.warn(f"The nodule lies out of what the {image} CBCT shows, so its place there is the model's alone.")
     _note(pose, collapse, stages)
     return Localization(prepared, pose, collapse, nodule_inf, nodule_def, lengths, axes, gates)
 
