@@ -53,14 +53,41 @@ class CageMotion:
         return np.stack([lateral, forward, up * free], axis=1)
 
     def inverse(self, points: Array, tolerance_mm: float = 1e-3) -> Array:
-        """CT points (n, 3) that the motion takes to `points` (n, 3), by fixed-point steps."""
+        """CT points (n, 3) that the motion takes to `points` (n, 3): fixed-point steps, Newton's where these run away.
+
+        Raises ValueError where the motion folds.
+        """
         source = points - self.displacement(points)
         for _ in range(60):
             error = source + self.displacement(source) - points
             source = source - error
             if np.abs(error).max() < tolerance_mm:
                 return source
-        raise ValueError("the motion of the chest wall folds, reduce its amplitudes")
+        left = np.abs(error).max(axis=1) >= tolerance_mm
+        source[left] = self._newton(points[left], tolerance_mm)
+        return source
+
+    def _newton(self, points: Array, tolerance_mm: float) -> Array:
+        """As `inverse`, along the way from no motion to all of it, so that every step starts near its end."""
+        source = points.copy()
+        for part in np.linspace(0, 1, 9)[1:]:
+            for _ in range(20):
+                error = source + part * self.displacement(source) - points
+                if np.abs(error).max() < tolerance_mm:
+                    break
+                gradient = np.eye(3) + part * self._gradient(source)
+                if (np.linalg.det(gradient) <= 0).any():
+                    break
+                source = source - np.linalg.solve(gradient, error[..., None])[..., 0]
+        if np.abs(source + self.displacement(source) - points).max() >= tolerance_mm:
+            raise ValueError("the motion of the chest wall folds, reduce its amplitudes")
+        return source
+
+    def _gradient(self, points: Array, step_mm: float = 0.05) -> Array:
+        """Slopes (n, 3, 3) of the displacement by central differences; the last axis is that of the step."""
+        steps = step_mm * np.eye(3)
+        ahead_behind = [(self.displacement(points + h), self.displacement(points - h)) for h in steps]
+        return np.stack([(a - b) / (2 * step_mm) for a, b in ahead_behind], axis=-1)
 
     def carry(self, distance: Lattice) -> Lattice:
         """Signed distance (mm) of a region of the CT after the motion."""

@@ -35,6 +35,20 @@ def test_inverse_undoes_the_motion(motion: CageMotion) -> None:
     assert_allclose(motion.inverse(motion(points)), points, atol=0.02)
 
 
+def test_inverse_undoes_a_fall_so_steep_that_fixed_point_steps_run_away(monkeypatch: pytest.MonkeyPatch) -> None:
+    newton, left = CageMotion._newton, []
+
+    def watched(self: CageMotion, points: np.ndarray, tolerance_mm: float) -> np.ndarray:
+        left.append(len(points))
+        return newton(self, points, tolerance_mm)
+
+    monkeypatch.setattr(CageMotion, "_newton", watched)
+    motion = CageMotion(draw_build(np.random.default_rng(4)), -1, 30.0, 16.0, 50.0, 5.0)
+    points = np.random.default_rng(0).uniform([-150, -110, -200], [150, 110, 130], (20000, 3))
+    assert_allclose(motion.inverse(motion(points)), points, atol=0.02)
+    assert sum(left) > 0
+
+
 def test_dome_is_fitted_to_the_volume_and_the_carried_room_has_it() -> None:
     build = draw_build(np.random.default_rng(4))
     lung = make_shapes(build).right_lung

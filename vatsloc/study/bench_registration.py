@@ -51,12 +51,12 @@ def bench_registration(folders: Sequence[Path], say: Say = quiet) -> dict[str, A
     """
     with TemporaryDirectory() as temporary:
         cases, cost = [], None
-        for given in folders or PHANTOMS:
-            folder = case_folder(given, Path(temporary), say)
+        for folder in [case_folder(given, Path(temporary), say) for given in folders or PHANTOMS]:
             name = folder.resolve().name
             say(f"{name}: ours ...")
             ours = isolated(run_ours, folder)
             cases.append(_case(name, ours, ElastixSettings(), say))
+            say("\n".join(_rows(cases[-1])))
             if cost is None:
                 say("cost against image size ...")
                 cost = measure_cost(ours.images)
@@ -146,16 +146,7 @@ def table(result: dict[str, Any]) -> str:
     """The benchmark as text."""
     lines = ["case              program              mean   95 %    max  seconds  peak MB  min det  folded"]
     for case in result["cases"]:
-        rows = {"rigid pose": case["rigid"], "ours": case["ours"]}
-        rows |= {f"elastix, {name}": row for name, row in (case["elastix_rows"] or {}).items()}
-        for name, r in rows.items():
-            errors = f"{case['name']:17s} {name:20s} {r['tre_mean']:4.2f} {r['tre_p95']:6.2f} {r['tre_max']:6.2f}"
-            cost = (
-                ""
-                if name == "rigid pose"
-                else (f" {r['seconds']:8.1f} {r['peak_mb']:8.0f} {r['min_det']:8.3f} {100 * r['folded_share']:6.2f}%")
-            )
-            lines.append(errors + cost)
+        lines += _rows(case)
     for case in result["cases"]:
         r = case["ours"]
         lines.append(
@@ -169,6 +160,21 @@ def table(result: dict[str, Any]) -> str:
     if result["elastix_version"] is None:
         lines.append("itk-elastix is not installed (pip install vatsloc[peers]): no comparison.")
     return "\n".join(lines)
+
+
+def _rows(case: dict[str, Any]) -> list[str]:
+    rows = {"rigid pose": case["rigid"], "ours": case["ours"]}
+    rows |= {f"elastix, {name}": row for name, row in (case["elastix_rows"] or {}).items()}
+    lines = []
+    for name, r in rows.items():
+        errors = f"{case['name']:17s} {name:20s} {r['tre_mean']:4.2f} {r['tre_p95']:6.2f} {r['tre_max']:6.2f}"
+        cost = (
+            ""
+            if name == "rigid pose"
+            else (f" {r['seconds']:8.1f} {r['peak_mb']:8.0f} {r['min_det']:8.3f} {100 * r['folded_share']:6.2f}%")
+        )
+        lines.append(errors + cost)
+    return lines
 
 
 def page(result: dict[str, Any]) -> str:
