@@ -1,0 +1,162 @@
+"""Commands `vatsloc bench` and `vatsloc stability`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from vatsloc.terminal import JsonOption, say, show
+
+bench = typer.Typer(no_args_is_help=True, help="Measure a part of the product, beside other programs where installed.")
+stability = typer.Typer(no_args_is_help=True, help="Show where a part of the product stops being right.")
+
+
+@bench.command("poro")
+def bench_poro_command(
+    cost: Annotated[bool, typer.Option("--cost", help="Also seconds and memory of every stage against mesh size.")] = (
+        False
+    ),
+    max_tets: Annotated[int, typer.Option(metavar="N", help="Largest mesh of the cost table.")] = 500_000,
+    out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="Markdown page to write.")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Poroelastic lung: displacements and speed beside GetFEM's, and cost against mesh size."""
+    from vatsloc.study.bench_poro import bench_poro, page, table
+    from vatsloc.study.cost_poro import SIZES
+
+    result = bench_poro(tuple(size for size in SIZES if cost and size <= max_tets), say=say)
+    say(table(result))
+    if out is not None:
+        out.write_text(page(result), encoding="utf-8")
+    if as_json:
+        show(result)
+
+
+@bench.command("registration")
+def bench_registration_command(
+    cases: Annotated[
+        list[Path] | None,
+        typer.Argument(metavar="CASES", help="Case folders, or NAME:SEED of a phantom; default: three phantoms."),
+    ] = None,
+    out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="Markdown page to write.")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Phase 1: errors at the landmarks, seconds, memory and folding beside itk-elastix, and cost against image size."""
+    from vatsloc.study.bench_registration import bench_registration, page, table
+
+    result = bench_registration(cases or [], say=say)
+    say(table(result))
+    if out is not None:
+        out.write_text(page(result), encoding="utf-8")
+    if as_json:
+        show(result)
+
+
+@bench.command("fit")
+def bench_fit_command(
+    cases: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            metavar="CASES", help="Case folders, folders of them, or NAME:SEED of a phantom; default: three phantoms."
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="DIR", help="Folder that keeps the results; a rerun goes on.")
+    ] = None,
+    jobs: Annotated[int, typer.Option(metavar="N", min=1, help="Cases run at once.")] = 1,
+    as_json: JsonOption = False,
+) -> None:
+    """The whole chain: errors, seconds, how often the ellipsoid holds the nodule, and the share of silent failures."""
+    from vatsloc.study.bench_fit import bench_fit, table
+
+    result = bench_fit(cases or [], out, jobs, say=say)
+    say(table(result))
+    if as_json:
+        show(result)
+
+
+@bench.command("cbct")
+def bench_cbct_command(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the phantom.")] = "demo",
+    seed: Annotated[int, typer.Option(metavar="N", help="Seed of the anatomy.")] = 0,
+    as_json: JsonOption = False,
+) -> None:
+    """The phantoms' cone-beam scanner in the image domain beside a C-arm's projections (extra "projections")."""
+    from vatsloc.study.bench_cbct import bench_cbct, table
+
+    result = bench_cbct(name, seed, say)
+    say(table(result))
+    if as_json:
+        show(result)
+
+
+@bench.command("real")
+def bench_real_command(
+    people: Annotated[
+        list[Path],
+        typer.Argument(metavar="DIR...", help="Folders with lung masks at two breath-holds and landmark pairs."),
+    ],
+    picture: Annotated[Path | None, typer.Option(help="PNG of the errors as arrows; needs the extra `report`.")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Real lungs: move one breath-hold into the other by shape alone; errors at landmarks that were only scored."""
+    from vatsloc.study.bench_real import bench_real, table
+    from vatsloc.study.chart_draw import require_matplotlib
+    from vatsloc.study.real_draw import draw_real
+
+    if picture is not None:
+        require_matplotlib()
+    result = bench_real(people, say=say)
+    say(table(result))
+    if picture is not None:
+        draw_real(people, picture)
+    if as_json:
+        show(result)
+
+
+@stability.command("poro")
+def stability_poro_command(
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for CSV files, plots and tables.md.")],
+) -> None:
+    """Poroelastic lung: pressure bounds, inverted elements, nu towards 0.5, contact methods, small hila."""
+    from vatsloc.study.stability_poro import stability_poro
+
+    stability_poro(out, say)
+    print(out / "tables.md")
+
+
+@stability.command("registration")
+def stability_registration_command(
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for CSV files, the plot and tables.md.")],
+) -> None:
+    """Registration: noise, view, start, motion, collapsed lung, and the spine's pose; goes on where it was stopped."""
+    from vatsloc.study.stability_registration import stability_registration
+
+    stability_registration(out, say)
+    print(out / "tables.md")
+
+
+@stability.command("fit")
+def stability_fit_command(
+    cases: Annotated[list[Path], typer.Argument(metavar="CASES...", help="Case folders with landmarks.")],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for CSV files and tables.md.")],
+) -> None:
+    """Collapse: disturbed surface, gravity, hilum and spine; random starts; what the surface tells of theta."""
+    from vatsloc.study.stability_fit import stability_fit
+    from vatsloc.workflow.settings import Settings
+
+    stability_fit(cases, out, Settings(), say)
+    print(out / "tables.md")
+
+
+@stability.command("choices")
+def stability_choices_command(
+    cases: Annotated[list[Path], typer.Argument(metavar="CASES...", help="Case folders.")],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for choices.md.")],
+) -> None:
+    """Preset auto: how far the nodule moves when a choice is made the other way."""
+    from vatsloc.study.choices import study_choices, table
+
+    print(table(study_choices(cases, out, say=say)))
