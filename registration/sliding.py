@@ -27,7 +27,7 @@ BEYOND_MM = 5.0
 LEADING_MM = 32.0
 """Finest control spacing that places lead alone; the finer levels, and this one once more, correct the first map."""
 SOFTER = 1 / 3
-"""Share of the bending weight that these keep: what they correct is small, so it may bend more easily."""
+"""Share of the bending weight that these keep where many places are found: what they correct is small then."""
 AROUND_MM = 20.0
 """What is kept around the lungs: more than they grow by, and more than voxels are blurred by."""
 FAR_MM, NEAR_MM = 24.0, 8.0
@@ -36,7 +36,7 @@ ROUGHLY = 0.3
 """Relative residual to which their steps are solved: closer takes longer and ends no nearer."""
 HOLD = 0.5
 """Share of their weight that places keep at the finest levels, where images are nearer than half a voxel."""
-ENOUGH = 300
+ENOUGH = 900
 """Fewer places hold less: the errors of each weigh more in their mean."""
 LEAST_PAIRS = 20
 """Fewer pairs than this may all be chance."""
@@ -61,7 +61,8 @@ def register_sliding(
     -1100 HU outside their lungs and compared inside the fixed lung grown by 5 mm, so the wall is met and nothing
     outside can pull. A smooth wall looks alike wherever it has slid to, and vessels look alike when the map starts far
     off, so places inside the lung are found first, up to 24 mm off the prior, and lead the coarse levels, down to a
-    control spacing of 32 mm; found again under that map, they hold the finest, which bend more easily. is_far: told the
+    control spacing of 32 mm; found again under that map, they hold the finest, and where there are many these bend
+    more easily. is_far: told the
     places found about the prior, says whether the coarse levels are needed (default always); without them those places
     hold the finest.
     """
@@ -90,9 +91,13 @@ def register_sliding(
     if is_far is None or is_far(holding):
         first = register(settings=coarse, prior=start, keypoints=holding).moving_from_fixed
         holding = found(first, NEAR_MM)
-    share = 0.0 if holding is None else HOLD * min(len(holding.fixed) / ENOUGH, 1.0)
+    detail = 0.0 if holding is None else min(len(holding.fixed) / ENOUGH, 1.0)
     weights = settings.weights
-    held = replace(weights, bending=SOFTER * weights.bending, keypoints=share * weights.keypoints)
+    held = replace(
+        weights,
+        bending=(1 - detail + detail * SOFTER) * weights.bending,
+        keypoints=HOLD * detail * weights.keypoints,
+    )
     finest = replace(settings, levels=min(settings.levels, finer + 1), weights=held, residual=ROUGHLY)
     return register(settings=finest, prior=first, keypoints=holding)
 
