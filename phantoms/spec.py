@@ -25,7 +25,8 @@ class Collapse:
     mediastinum falls; gas: "air" or "co2"; patchiness: factor on how uneven the tissue is; atelectasis: share of the
     lung, behind and below, that has lost its gas before the first cone-beam CT; lobes_apart: deviation of the logarithm
     of the lobes' rest volumes, where one traps gas and another empties; stiffness: factor on the shear modulus; root:
-    factor on how firmly the lung's root is held to the mediastinum and on how much stiffer it is than the rest."""
+    factor on how firmly the lung's root is held to the mediastinum and on how much stiffer it is than the rest;
+    adhesion: radius (mm) of a patch of the lung, out and up, that has grown to the chest wall, as after pleurisy."""
 
     inflated: float = 0.87
     deflated: float = 0.52
@@ -37,6 +38,7 @@ class Collapse:
     lobes_apart: float = 0.0
     stiffness: float = 1.0
     root: float = 1.0
+    adhesion: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -102,20 +104,20 @@ SPECS = {
             view=(0.0, 0.0, 45.0),
             fused=0.4,
             lesion=Lesion(place="apex", depth=12.0, radius=7.0),
-            collapse=Collapse(deflated=0.48, shift=25.0),
+            collapse=Collapse(deflated=0.48, shift=29.0),
         ),
         PhantomSpec(
             "base",
             "right",
             fused=0.0,
             lesion=Lesion(place="base", depth=10.0),
-            collapse=Collapse(shift=17.0, lobes_apart=0.1),
+            collapse=Collapse(shift=19.0, lobes_apart=0.1),
         ),
         PhantomSpec(
             "ground-glass",
             "right",
             lesion=Lesion("ground-glass", depth=18.0, radius=9.0),
-            collapse=Collapse(deflated=0.48, shift=29.0, patchiness=0.4),
+            collapse=Collapse(deflated=0.48, shift=32.0, patchiness=0.4),
         ),
         PhantomSpec(
             "part-solid", "left", fused=0.4, lesion=Lesion("part-solid", radius=11.0), collapse=Collapse(shift=24.0)
@@ -125,7 +127,7 @@ SPECS = {
             "left",
             view=(0.0, 0.0, 38.0),
             lesion=Lesion(radius=7.0),
-            collapse=Collapse(inflated=0.89, deflated=0.42, dome_rise=14.0, shift=34.0),
+            collapse=Collapse(inflated=0.89, deflated=0.42, dome_rise=14.0, shift=38.0),
             scanner=Scanner(fov=190.0, length=130.0),
         ),
         PhantomSpec(
@@ -151,6 +153,13 @@ SPECS = {
             collapse=Collapse(
                 inflated=0.91, deflated=0.58, dome_rise=14.0, shift=21.0, patchiness=0.3, stiffness=4.0, root=0.01
             ),
+        ),
+        PhantomSpec(
+            "adhesion",
+            "left",
+            view=(0.0, 0.0, 24.0),
+            fused=0.1,
+            collapse=Collapse(deflated=0.42, shift=32.0, lobes_apart=0.1, adhesion=28.0),
         ),
     )
 }

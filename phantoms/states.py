@@ -15,13 +15,15 @@ from phantoms.imaging import State
 from phantoms.lobes import surface_points
 from phantoms.patient import Patient
 from phantoms.spec import Collapse, PhantomSpec
-from phantoms.tissue import Equilibrium, Hilum, Pleura, Tissue, relax, tissue_points
+from phantoms.tissue import Equilibrium, Pleura, Tie, Tissue, relax, tissue_points
 
 Array = NDArray[Any]
 HINGE_MM = 13.0
 """Around the hilum, tissue of a lung in lobes is tied to the mediastinum this far, so that lobes may swing."""
 ROOT_KPA_MM = 300.0
 """Stiffness a point of the root's tie to the mediastinum."""
+SCAR_KPA_MM = 300.0
+"""Stiffness a point of the pleura's tie to the wall where the two have grown together."""
 
 
 def make_states(
@@ -55,13 +57,15 @@ def make_states(
 @dataclass(frozen=True)
 class LungBody:
     """The operated lung as a body that settles under loads. surface: points (n, 3) mm, areas (n,), lobes (n,); tied:
-    (n,) the tissue that belongs to the hilum; root: factor on how firmly it is held."""
+    (n,) the tissue that belongs to the hilum; root: factor on how firmly it is held; grown: (n,) the surface that has
+    grown to the chest wall."""
 
     patient: Patient
     tissue: Tissue
     surface: tuple[Array, Array, Array]
     tied: Array
     root: float
+    grown: Array
     element_mm: float
 
     def settle(
@@ -70,10 +74,13 @@ class LungBody:
         """The lung's room after the walls' motion, as a signed distance (mm), and the lung at rest in it."""
         lung, t = self.patient.lung, self.tissue
         cavity = motion.carry(lung)
-        hilum = Hilum(t.points[self.tied], motion(t.points[self.tied]), self.root * ROOT_KPA_MM, t.lobe[self.tied])
+        skin, _, lobe = (column[self.grown] for column in self.surface)
+        ties = [Tie(t.points[self.tied], motion(t.points[self.tied]), self.root * ROOT_KPA_MM, t.lobe[self.tied])]
+        if len(skin) > 0:
+            ties.append(Tie(skin, motion(skin), SCAR_KPA_MM, lobe))
         pleura = _pleura(self.surface, lung, cavity, held)
         lobes = self.patient.lobes
-        return cavity, relax(t, pleura, hilum, gravity, motion, volume_ratio, self.element_mm, lobes)
+        return cavity, relax(t, pleura, ties, gravity, motion, volume_ratio, self.element_mm, lobes)
 
 
 def lung_body(patient: Patient, collapse: Collapse, element_mm: float, rng: np.random.Generator) -> LungBody:
@@ -84,7 +91,22 @@ def lung_body(patient: Patient, collapse: Collapse, element_mm: float, rng: np.r
     tied = np.linalg.norm(points - patient.hilum, axis=1) < (20.0 if len(lobes.regions) == 1 else HINGE_MM)
     shear, slack = _uneven(patient, points, lobe, collapse, rng)
     rest = np.cbrt(np.clip(collapse.deflated * slack, 0.15, 0.95))
-    return LungBody(patient, Tissue(points, volume, shear, rest, 165.0, lobe), surface, tied, collapse.root, element_mm)
+    tissue = Tissue(points, volume, shear, rest, 165.0, lobe)
+    grown = _grown_to_wall(surface[0], patient, collapse.adhesion)
+    return LungBody(patient, tissue, surface, tied, collapse.root, grown, element_mm)
+
+
+def _grown_to_wall(points: Array, patient: Patient, radius: float) -> Array:
+    """Whether points (n, 3) of the lobes' surfaces have grown to the chest wall: those of the costal pleura within
+    `radius` (mm) of its place furthest out and up."""
+    outer = _on_wall(points, patient.lung)
+    middle = points[np.argmax(np.where(outer, points @ [patient.sign, 0.0, 0.5], -np.inf))]
+    return outer & (np.linalg.norm(points - middle, axis=1) < radius)
+
+
+def _on_wall(points: Array, lung: Lattice) -> Array:
+    """Whether points (n, 3) of the lobes' surfaces lie on the surface of the whole lung, not in a fissure."""
+    return np.asarray(lung.sample(points) > -1.5)
 
 
 def _by_lobe(parts: list[tuple[Array, Array]]) -> tuple[Array, Array, Array]:
@@ -96,7 +118,7 @@ def _by_lobe(parts: list[tuple[Array, Array]]) -> tuple[Array, Array, Array]:
 def _pleura(surface: tuple[Array, Array, Array], lung: Lattice, cavity: Lattice, held: bool) -> Pleura:
     """What touches the wall: all of the lobes' surfaces where they are free, only their outer sides where held."""
     points, area, lobe = surface
-    outer = lung.sample(points) > -1.5 if held and lobe.max() > 0 else np.full(len(points), True)
+    outer = _on_wall(points, lung) if held and lobe.max() > 0 else np.full(len(points), True)
     return Pleura(points[outer], area[outer], cavity, held, lobe[outer])
 
 

@@ -9,7 +9,7 @@ Ref: Bonet and Wood 2008, eq. 6.27 (the tissue).
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -55,9 +55,9 @@ class Pleura:
 
 
 @dataclass(frozen=True)
-class Hilum:
-    """Tissue tied to the mediastinum. points: (n, 3) mm in the CT; target: (n, 3) mm in the state; stiffness: kPa mm
-    a point; lobe: (n,)."""
+class Tie:
+    """Tissue tied to the mediastinum or the wall. points: (n, 3) mm in the CT; target: (n, 3) mm in the state;
+    stiffness: kPa mm a point; lobe: (n,)."""
 
     points: Array
     target: Array
@@ -87,7 +87,7 @@ def tissue_points(lung: Lattice, step_mm: float) -> tuple[Array, Array]:
 def relax(
     tissue: Tissue,
     pleura: Pleura,
-    hilum: Hilum,
+    ties: Sequence[Tie],
     gravity: Array,
     guess: Callable[[Array], Array],
     volume_ratio: float | None,
@@ -102,7 +102,7 @@ def relax(
     """
     low, high = tissue.points.min(axis=0) - 2.5 * spacing_mm, tissue.points.max(axis=0) + 2.5 * spacing_mm
     nx, ny, nz = (int(n) for n in np.ceil((high - low) / spacing_mm) + 1)
-    problem = _Problem(tissue, pleura, hilum, gravity, lobes, low, spacing_mm, (nx, ny, nz))
+    problem = _Problem(tissue, pleura, ties, gravity, lobes, low, spacing_mm, (nx, ny, nz))
     u = problem.fit(guess)
     histories: list[Array] = []
     for _ in range(4):
@@ -124,14 +124,14 @@ class _Problem:
         self,
         tissue: Tissue,
         pleura: Pleura,
-        hilum: Hilum,
+        ties: Sequence[Tie],
         gravity: Array,
         lobes: Lobes,
         origin: Array,
         spacing: float,
         shape: tuple[int, int, int],
     ) -> None:
-        self.tissue, self.pleura, self.hilum, self.lobes = tissue, pleura, hilum, lobes
+        self.tissue, self.pleura, self.lobes = tissue, pleura, lobes
         self.origin, self.spacing, self.shape = origin, spacing, shape
         inside, *slopes = self._basis(tissue.points, tissue.lobe)
         self.active = np.flatnonzero(inside.sum(axis=0) > 0)
@@ -139,10 +139,10 @@ class _Problem:
         self.value = inside[:, self.active]
         self.slopes = [s[:, self.active] for s in slopes]
         self.on_pleura = self._basis(pleura.points, pleura.lobe)[0][:, self.active]
-        self.on_hilum = self._basis(hilum.points, hilum.lobe)[0][:, self.active]
+        self.ties = [(tie, self._basis(tie.points, tie.lobe)[0][:, self.active]) for tie in ties]
         joint = make_joint(lobes, pleura.held)
         self.sides = joint.sides
-        self.ties = [(self._jump(side), side.stiffness[:, None]) for side in joint.grown]
+        self.grown = [(self._jump(side), side.stiffness[:, None]) for side in joint.grown]
         self.lame = 1.5 * tissue.shear
         self.contact = (4.0 if pleura.held else 1.5) * pleura.area
         weight = tissue.density * 9.81e-6 * tissue.volume
@@ -151,10 +151,12 @@ class _Problem:
         self.smooth = self._roughness(spacing) * (0.02 * float(tissue.shear.mean()))
         laplace = sum((s.T @ (s * (3 * stiff)[:, None]) for s in self.slopes), start=self.smooth)
         touch = self.on_pleura.T @ (self.on_pleura * (self.contact / 3)[:, None])
-        tie = self.on_hilum.T @ (self.on_hilum * hilum.stiffness)
-        for jump, stiffness in self.ties + [(self._jump(s), TOUCH_SHARE * s.stiffness[:, None]) for s in self.sides]:
+        for jump, stiffness in self.grown + [(self._jump(s), TOUCH_SHARE * s.stiffness[:, None]) for s in self.sides]:
             touch = touch + jump.T @ (jump * stiffness)
-        self.metric = splu(sparse.csc_array(laplace + touch + tie))
+        metric = laplace + touch
+        for tie, on in self.ties:
+            metric = metric + on.T @ (on * tie.stiffness)
+        self.metric = splu(sparse.csc_array(metric))
 
     def _basis(self, points: Array, lobe: Array) -> list[sparse.csr_array]:
         """As `basis`, with the columns of one lobe after those of another."""
@@ -243,10 +245,11 @@ class _Problem:
         push = self.contact * depth
         total += 0.5 * float(push @ depth)
         gradient = gradient + self.on_pleura.T @ (push[:, None] * normal)
-        pull = self.hilum.points + self.on_hilum @ u - self.hilum.target
-        total += 0.5 * self.hilum.stiffness * float((pull**2).sum())
-        gradient = gradient + self.hilum.stiffness * (self.on_hilum.T @ pull)
-        for jump, stiffness in self.ties:
+        for tie, on in self.ties:
+            pull = tie.points + on @ u - tie.target
+            total += 0.5 * tie.stiffness * float((pull**2).sum())
+            gradient = gradient + tie.stiffness * (on.T @ pull)
+        for jump, stiffness in self.grown:
             tear = jump @ u
             total += 0.5 * float((stiffness * tear**2).sum())
             gradient = gradient + jump.T @ (stiffness * tear)

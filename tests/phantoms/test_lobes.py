@@ -13,7 +13,7 @@ from phantoms.fields import Lattice, as_distance, lattice_over
 from phantoms.fissure_contact import contact_energy, make_joint
 from phantoms.lobes import Fissures, LobedMap, Lobes, Sheet, cut, surface_points
 from phantoms.spline import SplineMap
-from phantoms.tissue import Equilibrium, Hilum, Pleura, Tissue, _Problem, relax, tissue_points
+from phantoms.tissue import Equilibrium, Pleura, Tie, Tissue, _Problem, relax, tissue_points
 
 RADIUS = 40.0
 PLANE = Sheet(np.zeros(3), 0.0, 0.0, 0.0)
@@ -32,7 +32,7 @@ def halves(ball: Lattice) -> Lobes:
     return cut(ball, Fissures(PLANE, None))
 
 
-def _parts(lobes: Lobes, wall: Lattice, moved: np.ndarray, held: bool = False) -> tuple[Tissue, Pleura, Hilum]:
+def _parts(lobes: Lobes, wall: Lattice, moved: np.ndarray, held: bool = False) -> tuple[Tissue, Pleura, list[Tie]]:
     """Halves at rest in `wall`, the upper one pulled by `moved` mm at all of its tissue beyond 20 mm of the fissure."""
     filled = [tissue_points(region, 8.0) for region in lobes.regions]
     lobe = np.repeat([0, 1], [len(p) for p, _ in filled])
@@ -48,7 +48,8 @@ def _parts(lobes: Lobes, wall: Lattice, moved: np.ndarray, held: bool = False) -
         np.repeat([0, 1], [len(p) for p, _ in skin]),
     )
     tied = np.abs(points[:, 2]) > 20
-    return tissue, pleura, Hilum(points[tied], points[tied] + moved * (lobe[tied] == 0)[:, None], 300.0, lobe[tied])
+    target = points[tied] + moved * (lobe[tied] == 0)[:, None]
+    return tissue, pleura, [Tie(points[tied], target, 300.0, lobe[tied])]
 
 
 def _moved(lobes: Lobes, ball: Lattice, moved: list[float]) -> Equilibrium:
@@ -124,8 +125,8 @@ def test_pushes_between_lobes_cancel(halves: Lobes) -> None:
 @pytest.mark.parametrize("held", [True, False])
 def test_energy_of_lobes_falls_along_its_gradient_at_the_rate_it_says(ball: Lattice, halves: Lobes, held: bool) -> None:
     some = replace(halves, fissures=replace(halves.fissures, grown_mm=15.0))
-    tissue, pleura, hilum = _parts(some, ball, np.array([3.0, 0, 0]), held)
-    problem = _Problem(tissue, pleura, hilum, DOWN, some, np.full(3, -80.0), 20.0, (9, 9, 9))
+    tissue, pleura, ties = _parts(some, ball, np.array([3.0, 0, 0]), held)
+    problem = _Problem(tissue, pleura, ties, DOWN, some, np.full(3, -80.0), 20.0, (9, 9, 9))
     rng = np.random.default_rng(1)
     u = rng.normal(0, 0.5, (len(problem.active), 3))
     way = rng.standard_normal(u.shape)

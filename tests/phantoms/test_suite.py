@@ -11,7 +11,7 @@ import pytest
 
 from phantoms import SPECS, SUITE, PhantomCase
 from phantoms.measures import affine_share
-from phantoms.states import make_states
+from phantoms.states import lung_body, make_states
 from phantoms.thorax import draw_thorax
 from vatsloc.errors import CaseError
 from vatsloc.phantom_case import read_info, recipe, write_phantom
@@ -44,6 +44,24 @@ def test_stiff_even_tissue_on_a_loose_root_moves_almost_as_an_affine_map() -> No
         shares.append(affine_share(inflated.lung_map(tissue), deflated.lung_map(tissue)))
     assert 0.10 < shares[0] < 0.14
     assert shares[0] < shares[1] - 0.03
+
+
+def test_pleura_that_has_grown_to_the_chest_wall_goes_with_it_and_no_other_does() -> None:
+    spec = replace(SPECS["adhesion"], element=28.0, fused=1.0)
+    grown = spec.collapse
+    person = draw_thorax(spec.side, spec.habitus, spec.lesion, SUITE["adhesion"]).patient
+    body = lung_body(person, grown, spec.element, np.random.default_rng(0))
+    scar = body.surface[0][body.grown]
+    assert np.ptp(scar, axis=0).max() == pytest.approx(2 * grown.adhesion, rel=0.15)
+    off, depth = [], []
+    for collapse in (grown, replace(grown, adhesion=0.0)):
+        rng = np.random.default_rng(0)
+        (_, deflated), _, _ = make_states(person, replace(spec, collapse=collapse), rng)
+        off.append(np.linalg.norm(deflated.lung_map(scar) - deflated.motion(scar), axis=1))
+        depth.append(deflated.cavity.at(deflated.lung_map(scar)))
+    assert off[0].max() < 2.0
+    assert np.abs(depth[0]).max() < 2.0
+    assert off[1].min() > 8.0
 
 
 def test_a_case_that_is_there_is_kept_and_tabled(
