@@ -120,7 +120,7 @@ SPECS = {
             collapse=Collapse(deflated=0.48, shift=32.0, patchiness=0.4),
         ),
         PhantomSpec(
-            "part-solid", "left", fused=0.4, lesion=Lesion("part-solid", radius=11.0), collapse=Collapse(shift=24.0)
+            "part-solid", "left", fused=0.4, lesion=Lesion("part-solid", radius=11.0), collapse=Collapse(shift=25.0)
         ),
         PhantomSpec(
             "tight-view",
