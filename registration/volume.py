@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 Array = NDArray[Any]
 Cut = tuple[slice, slice, slice]
@@ -150,6 +151,14 @@ class Mask(_OnGrid):
         result = np.zeros(len(ijk), dtype=bool)
         result[within] = self.inside[tuple(ijk[within].T)]
         return result
+
+    def distance(self, point_ras: Array) -> float:
+        """How far in mm a point (3,) lies from the nearest voxel centre of the region; 0 in one of its voxels, infinite
+        from an empty region."""
+        if self.holds(point_ras[None])[0]:
+            return 0.0
+        rim = np.argwhere(self.inside & ~ndimage.binary_erosion(self.inside))
+        return float(np.linalg.norm(self.grid.to_ras(rim.astype(float)) - point_ras, axis=1).min(initial=np.inf))
 
     def part(self, cut: Cut) -> Mask:
         """The voxels of three slices."""

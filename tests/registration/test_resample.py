@@ -90,6 +90,16 @@ def test_a_displacement_field_refuses_scalars() -> None:
         DisplacementField(np.zeros((2, 2, 2)), np.eye(4))
 
 
+def test_distance_to_a_mask_is_that_to_its_nearest_voxel() -> None:
+    inside = np.zeros((6, 5, 5), bool)
+    inside[1:4, 2, 2] = True
+    mask = Mask(inside, np.diag([2.0, 2.0, 2.0, 1.0]))
+    assert mask.distance(np.array([4.5, 4.0, 4.0])) == 0
+    assert mask.distance(np.array([9.0, 8.0, 4.0])) == pytest.approx(5.0)
+    assert mask.distance(np.array([-100.0, 4.0, 4.0])) == pytest.approx(102.0)
+    assert Mask(inside & False, np.eye(4)).distance(np.zeros(3)) == np.inf
+
+
 def test_a_mask_holds_points_in_its_voxels_and_none_beyond_the_grid() -> None:
     inside = np.zeros((4, 3, 2), dtype=bool)
     inside[1, 2, 1] = True

@@ -77,6 +77,7 @@ def test_run_holds_the_agreed_keys(run: dict[str, Any]) -> None:
     assert {choice["part"] for choice in run["choices"] if not choice["kept"]} <= set(run["skipped"])
     assert set(run["theta"]) == {"kappa_b", "phi", "d_diaph_mm"}
     assert all(set(gate) >= {"ok", "value", "limit"} for gate in run["gates"].values())
+    assert run["gates"]["nodule_in_view"]["value"] == 0
     layer = f"The pressure layer, {Tissue().layer_mm(run['theta']['kappa_b']):.1f} mm, "
     assert run["residuals"]["fit"]["pressure_layer"].startswith(layer)
     stages = {name: seconds for name, seconds in run["seconds"].items() if name != "total"}

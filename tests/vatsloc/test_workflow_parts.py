@@ -9,10 +9,11 @@ import pytest
 
 from poro.mesh import TetMesh, stuff_level_set
 from registration.rigid import RigidTransform
-from registration.volume import Grid
+from registration.volume import Grid, Mask
 from vatsloc.errors import CaseError, InputRefused
 from vatsloc.maps import MeshMap, covered, sampled
 from vatsloc.workflow.gates import at_least, at_most
+from vatsloc.workflow.localize import in_view
 from vatsloc.workflow.observe import hand_placed
 from vatsloc.workflow.settings import load_settings
 from vatsloc.workflow.stages import Stages
@@ -130,3 +131,16 @@ def test_hand_placed_points_look_away_from_the_lung() -> None:
         placed = hand_placed(corners, triangles)
         assert ((corners - corners.mean(axis=0)) * placed.normals).sum(axis=1).min() > 0
         np.testing.assert_allclose(np.linalg.norm(placed.normals, axis=1), 1.0)
+
+
+@pytest.mark.parametrize(("out_mm", "warned", "ok"), [(0.0, False, True), (6.0, True, True), (20.0, True, False)])
+def test_a_nodule_out_of_a_view_is_warned_of_and_far_out_of_it_not_to_be_trusted(
+    out_mm: float, warned: bool, ok: bool
+) -> None:
+    view = Mask(np.ones((4, 4, 4), bool), np.diag([2.0, 2.0, 2.0, 1.0]))
+    stages = Stages()
+    shown = {"inflated": (view, np.array([6.0 + out_mm, 2.0, 2.0])), "deflated": (view, np.array([2.0, 2.0, 2.0]))}
+    gate = in_view(shown, 10.0, stages)
+    assert gate.ok is ok
+    assert gate.value == pytest.approx(out_mm)
+    assert [f"{out_mm:.0f} mm out of what the inflated CBCT shows" in w for w in stages.warnings] == [True] * warned

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +12,7 @@ from poro.mesh import closest_points, interpolate, locate
 from poro.mesh.tetmesh import signed_volumes
 from poro.model import PoroStatus
 from registration.spine import RigidFit
-from registration.volume import Array
+from registration.volume import Array, Mask
 from vatsloc.case import Case
 from vatsloc.errors import NotConverged
 from vatsloc.imaging.surface import Border
@@ -94,14 +95,25 @@ def conclude(
     gates["ellipsoid"] = at_most(
         lengths[0], settings.gates.max_ellipsoid_mm, "The nodule's position is too uncertain for a wedge resection."
     )
-    for image, cbct, nodule in (
-        ("inflated", prepared.inflated, nodule_inf),
-        ("deflated", prepared.deflated, nodule_def),
-    ):
-        if not cbct.field.usable.holds(nodule[None])[0]:
-            stages.warn(f"The nodule lies out of what the {image} CBCT shows, so its place there is the model's alone.")
+    shown = {
+        "inflated": (prepared.inflated.field.usable, nodule_inf),
+        "deflated": (prepared.deflated.field.usable, nodule_def),
+    }
+    gates["nodule_in_view"] = in_view(shown, settings.gates.max_out_of_view_mm, stages)
     _note(pose, collapse, stages)
     return Localization(prepared, pose, collapse, nodule_inf, nodule_def, lengths, axes, gates)
+
+
+def in_view(shown: Mapping[str, tuple[Mask, Array]], limit_mm: float, stages: Stages) -> Gate:
+    """Gate on how far out of each image's field of view the nodule (3,) lies there; warns wherever it does."""
+    out_mm = {image: field.distance(nodule) for image, (field, nodule) in shown.items()}
+    for image, distance in out_mm.items():
+        if distance > 0:
+            stages.warn(
+                f"The nodule lies {distance:.0f} mm out of what the {image} CBCT shows, "
+                "so its place there is the model's alone."
+            )
+    return at_most(max(out_mm.values()), limit_mm, "The nodule lies far out of a CBCT's view.")
 
 
 def nodule_ellipsoid(

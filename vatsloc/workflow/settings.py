@@ -107,6 +107,7 @@ class GateSettings(_Table):
     max_model_error_mm: float = 10.0
     max_held_back_mm: float = 5.0
     max_ellipsoid_mm: float = 15.0
+    max_out_of_view_mm: float = 10.0
 
 
 class Settings(_Table):
