@@ -38,6 +38,6 @@ def draw_disturbed(rows: list[Row], silent_mm: float, file: Path) -> None:
     axes.invert_yaxis()
     axes.set_xlim(left=0)
     axes.set_xlabel(f"mean error at the landmarks, mm (beyond {silent_mm:g} a failure)")
-    axes.legend(fontsize="small")
+    axes.legend(fontsize="small", loc="center right")
     figure.savefig(file, dpi=110)
     pyplot.close(figure)
