@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import inspect
 from collections.abc import Callable
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -43,27 +44,28 @@ def pressure_bounds() -> list[Row]:
 
 
 def inverted_elements() -> list[Row]:
-    """Smallest det F and inverted share over (kappa_b, phi), linear against neo-Hookean."""
+    """Smallest det F and inverted share over (kappa_b, phi) and the diaphragm's rise, linear against neo-Hookean."""
     system, rows, law = system_of(lung(TETS), _TISSUE, smooth_wall()), [], neo_hookean(_TISSUE)
-    for kappa_b in (1e-9, 1e-8, 1e-6):
-        for phi in (0.3, 0.6, 0.9):
-            theta = Theta(kappa_b, phi)
-            linear, finite = solve(system, theta), deform(finite_problem(system, theta, law))
-            det = np.linalg.det(deformation_gradient(system.mesh, finite.u))
-            total = system.mesh.volumes.sum()
-            rows.append(
-                {
-                    "kappa_b": kappa_b,
-                    "phi": phi,
-                    "linear_min_det": float(linear.det_f.min()),
-                    "linear_inverted_percent": 100 * linear.inverted_share,
-                    "linear_volume": float(linear.det_f @ system.mesh.volumes / total),
-                    "finite_min_det": float(det.min()),
-                    "finite_volume": float(det @ system.mesh.volumes / total),
-                    "finite_load_carried": finite.share,
-                    "newton_steps": len(finite.residuals),
-                }
-            )
+    phis = (0.3, 0.6, 0.9)
+    values = [*product((1e-9, 1e-8, 1e-6), phis, (0.0,)), *product((1e-9,), phis, (40.0,))]
+    for theta in (Theta(*value) for value in values):
+        linear, finite = solve(system, theta), deform(finite_problem(system, theta, law))
+        det = np.linalg.det(deformation_gradient(system.mesh, finite.u))
+        total = system.mesh.volumes.sum()
+        rows.append(
+            {
+                "kappa_b": theta.kappa_b,
+                "phi": theta.phi,
+                "d_diaph_mm": theta.d_diaph_mm,
+                "linear_min_det": float(linear.det_f.min()),
+                "linear_inverted_percent": 100 * linear.inverted_share,
+                "linear_volume": float(linear.det_f @ system.mesh.volumes / total),
+                "finite_min_det": float(det.min()),
+                "finite_volume": float(det @ system.mesh.volumes / total),
+                "finite_load_carried": finite.share,
+                "newton_steps": len(finite.residuals),
+            }
+        )
     return rows
 
 

@@ -41,7 +41,7 @@ def _pressure(rows: list[Row]) -> str:
 def _inverted(rows: list[Row]) -> str:
     worst = max(row["linear_inverted_percent"] for row in rows)
     inverted = (
-        f"up to {worst:.1f} % of this smooth lung's elements invert" if worst else "no element of this lung inverts"
+        f"up to {worst:.2g} % of this smooth lung's elements invert" if worst else "no element of this lung inverts"
     )
     more = max(row["finite_volume"] - row["linear_volume"] for row in rows)
     carried = sum(row["finite_load_carried"] == 1 for row in rows)
