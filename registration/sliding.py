@@ -61,10 +61,9 @@ def register_sliding(
     -1100 HU outside their lungs and compared inside the fixed lung grown by 5 mm, so the wall is met and nothing
     outside can pull. A smooth wall looks alike wherever it has slid to, and vessels look alike when the map starts far
     off, so places inside the lung are found first, up to 24 mm off the prior, and lead the coarse levels, down to a
-    control spacing of 32 mm; found again under that map, they hold the finest, and where there are many these bend
-    more easily. is_far: told the
-    places found about the prior, says whether the coarse levels are needed (default always); without them those places
-    hold the finest.
+    control spacing of 32 mm; found again under that map, they hold the finest, and where there are many these bend more
+    easily. is_far: told the places found about the prior, says whether the coarse levels are needed (default always);
+    without them those places hold the finest.
     """
     if fixed_lung is None:
         fixed_lung = _carried(fixed, moving, moving_lung, settings, seen, prior)
