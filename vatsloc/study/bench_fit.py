@@ -52,7 +52,7 @@ def _row(outcome: Outcome, results: Path) -> dict[str, Any]:
     stages = json.loads(run.read_text(encoding="utf-8"))["seconds"] if outcome.scores is not None else None
     return {
         "name": outcome.name,
-        "seconds": round(outcome.seconds, 1),
+        "seconds": round(outcome.seconds, 3),
         "seconds_fit": None if stages is None else round(sum(stages.get(name, 0.0) for name in FIT_STAGES), 1),
         "chain_mean": outcome.phase("chain", "mean"),
         "nodule_mm": outcome.nodule_mm,
