@@ -13,7 +13,7 @@ from math import ceil, log2
 import numpy as np
 
 from registration.corrected import on_grid
-from registration.ffd import FfdFit, FfdSettings, register_ffd
+from registration.ffd import FfdFit, FfdSettings, Weights, register_ffd
 from registration.field import PointMap
 from registration.matching import MatchSettings, match_keypoints
 from registration.nearby import bounding_box, grown
@@ -90,15 +90,17 @@ def register_sliding(
     if is_far is None or is_far(holding):
         first = register(settings=coarse, prior=start, keypoints=holding).moving_from_fixed
         holding = found(first, NEAR_MM)
-    detail = 0.0 if holding is None else min(len(holding.fixed) / ENOUGH, 1.0)
-    weights = settings.weights
-    held = replace(
-        weights,
-        bending=(1 - detail + detail * SOFTER) * weights.bending,
-        keypoints=HOLD * detail * weights.keypoints,
-    )
+    held = finest_weights(settings.weights, 0 if holding is None else len(holding.fixed))
     finest = replace(settings, levels=min(settings.levels, finer + 1), weights=held, residual=ROUGHLY)
     return register(settings=finest, prior=first, keypoints=holding)
+
+
+def finest_weights(weights: Weights, places: int) -> Weights:
+    """Weights of the finest levels: the more places were found, up to `ENOUGH`, the more they hold and the less bending
+    costs."""
+    detail = min(places / ENOUGH, 1.0)
+    bending = (1 - detail + detail * SOFTER) * weights.bending
+    return replace(weights, bending=bending, keypoints=HOLD * detail * weights.keypoints)
 
 
 def _found_again(

@@ -14,7 +14,7 @@ from registration.nearby import grown
 from registration.newton import Stop
 from registration.penalties import Keypoints
 from registration.rigid import RigidTransform
-from registration.sliding import masked, register_sliding
+from registration.sliding import finest_weights, masked, register_sliding
 from registration.volume import Array, Grid, Mask, Volume
 from tests.registration.scenes import image_of, make_pattern, oriented
 
@@ -226,3 +226,11 @@ def test_fields_of_a_fit_lie_on_grids_parallel_to_the_fixed_image() -> None:
     control = control_grid(GRID, 16.0)
     spline = BSplineField(np.zeros((*control.shape, 3)), control.ras_from_ijk)
     assert spline.dense(GRID).grid.same_as(GRID)
+
+
+def test_few_places_hold_the_finest_levels_little_and_let_them_bend_little() -> None:
+    given = Weights(bending=6.0, keypoints=2.0)
+    none, some, many = (finest_weights(given, n) for n in (0, 450, 5000))
+    assert (none.bending, none.keypoints) == (6.0, 0.0)
+    assert (some.bending, some.keypoints) == (pytest.approx(4.0), pytest.approx(0.5))
+    assert (many.bending, many.keypoints) == (pytest.approx(2.0), pytest.approx(1.0))

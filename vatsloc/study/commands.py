@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -11,6 +12,17 @@ from vatsloc.terminal import JsonOption, say, show
 
 bench = typer.Typer(no_args_is_help=True, help="Measure a part of the product, beside other programs where installed.")
 stability = typer.Typer(no_args_is_help=True, help="Show where a part of the product stops being right.")
+
+
+def _report(
+    result: dict[str, Any], table: Callable[..., str], page: Callable[..., str], out: Path | None, as_json: bool
+) -> None:
+    """Table on stderr, page to a file and JSON on stdout, where they are asked for."""
+    say(table(result))
+    if out is not None:
+        out.write_text(page(result), encoding="utf-8")
+    if as_json:
+        show(result)
 
 
 @bench.command("poro")
@@ -27,11 +39,7 @@ def bench_poro_command(
     from vatsloc.study.cost_poro import SIZES
 
     result = bench_poro(tuple(size for size in SIZES if cost and size <= max_tets), say=say)
-    say(table(result))
-    if out is not None:
-        out.write_text(page(result), encoding="utf-8")
-    if as_json:
-        show(result)
+    _report(result, table, page, out, as_json)
 
 
 @bench.command("registration")
@@ -47,11 +55,7 @@ def bench_registration_command(
     from vatsloc.study.bench_registration import bench_registration, page, table
 
     result = bench_registration(cases or [], say=say)
-    say(table(result))
-    if out is not None:
-        out.write_text(page(result), encoding="utf-8")
-    if as_json:
-        show(result)
+    _report(result, table, page, out, as_json)
 
 
 @bench.command("fit")
