@@ -199,20 +199,28 @@ def fit(
     )
 
 
-def ellipsoid95(
-    result: Fit, system: PoroSystem, point: Array, unexplained_mm: float | None = None
-) -> tuple[Array, Array]:
-    """Half axes (3,) mm, longest first, and directions (3, 3) in columns, that hold a point's deflated image with 95 %.
+def point_covariance(
+    result: Fit, system: PoroSystem, points: Array, unexplained_mm: float | Array | None = None
+) -> Array:
+    """Covariance (k, 3, 3) mm2 of where points (k, 3) lie after the collapse.
 
-    The parameters' covariance carried to the point, plus the standard deviation per axis of what no parameter explains:
-    by default what the fit leaves at the points it sees; after a correction give its held-out misfit.
+    The parameters' covariance carried to the points, plus the standard deviation per axis, one or (k,), of what no
+    parameter explains: by default what the fit leaves at the points it sees; after a correction give its held-out
+    misfit.
     """
-    du = interpolate(locate(system.mesh, np.atleast_2d(point)), result.sensitivity)[0]
+    du = interpolate(locate(system.mesh, np.atleast_2d(points)), result.sensitivity)
     left = max(result.surface_rms_mm, result.keypoint_rms_mm / np.sqrt(3))
-    unexplained = left if unexplained_mm is None else unexplained_mm
-    spread = du @ result.covariance @ du.T + unexplained**2 * np.eye(3)
-    values, vectors = np.linalg.eigh(spread)
-    return np.sqrt(CHI2_95_3D * values[::-1]), vectors[:, ::-1]
+    unexplained = np.atleast_1d(left if unexplained_mm is None else unexplained_mm)
+    carried = np.einsum("kip,pq,kjq->kij", du, result.covariance, du, optimize=True)
+    return np.asarray(carried + unexplained[:, None, None] ** 2 * np.eye(3))
+
+
+def ellipsoid95(covariance: Array) -> tuple[Array, Array]:
+    """Semi-axes (k, 3) mm, longest first, and their directions (k, 3, 3) in rows, of the ellipsoids that hold points of
+    covariance (k, 3, 3) mm2 with 95 %.
+    """
+    values, vectors = np.linalg.eigh(covariance)
+    return np.sqrt(CHI2_95_3D * values[:, ::-1]), vectors[:, :, ::-1].swapaxes(1, 2)
 
 
 def _descend(problem: _Problem, theta: Array) -> tuple[Array, PoroState, tuple[FitStep, ...], bool]:

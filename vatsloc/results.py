@@ -38,6 +38,8 @@ RIGID_CT_FROM_INFLATED = "from-CBCTinflated_to-CT_mode-image_desc-rigid_xfm.tfm"
 RIGID_DEFLATED_FROM_INFLATED = "from-CBCTinflated_to-CBCTdeflated_mode-points_desc-rigid_xfm.tfm"
 RIGID_INFLATED_FROM_DEFLATED = "from-CBCTdeflated_to-CBCTinflated_mode-image_desc-rigid_xfm.tfm"
 REPORT, SCENE = "report.html", "scene.mrml"
+RADIUS95 = "radius95_mm"
+"""Of the nodes of `LUNG_DEFLATED`: how far off the tissue there may be, 95 %."""
 
 OUTPUT_FILES = (
     NODULE_INFLATED,

@@ -20,6 +20,7 @@ from poro.fit import (
     _worth,
     ellipsoid95,
     fit,
+    point_covariance,
 )
 from poro.identify import THETA_NAMES, identifiability
 from poro.mesh import interpolate, locate
@@ -143,10 +144,16 @@ def _inner(target: Target) -> tuple[Array, Array, Array]:
 
 
 def test_ellipsoid_grows_with_what_is_unknown(recovered: Fit, system: PoroSystem) -> None:
-    axes, directions = ellipsoid95(recovered, system, np.array([5.0, 5, 5]))
+    points = np.array([[5.0, 5, 5], [8.0, 5, 5]])
+    covariance = point_covariance(recovered, system, points)
+    axes, directions = ellipsoid95(covariance)
     assert (np.diff(axes) <= 0).all()
-    assert_allclose(directions.T @ directions, np.eye(3), atol=1e-12)
-    assert axes[0] < 2.0
+    assert_allclose(directions @ directions.swapaxes(1, 2), np.broadcast_to(np.eye(3), (2, 3, 3)), atol=1e-12)
+    assert axes.max() < 2.0
+    again = np.einsum("ka,kai,kaj->kij", axes**2 / 7.814728, directions, directions)
+    assert_allclose(again, covariance, rtol=1e-9)
+    surer = point_covariance(recovered, system, points, np.array([0.0, 3.0]))
+    assert_allclose(surer[1] - point_covariance(recovered, system, points[1:], 0.0)[0], 9 * np.eye(3), atol=1e-9)
     assert np.linalg.eigvalsh(recovered.covariance).min() > 0
 
 

@@ -6,6 +6,7 @@ import csv
 import os
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -108,15 +109,23 @@ def test_a_rerun_takes_up_only_what_crashed_or_changed(
 def test_coverage_and_silent_failures_are_shares_of_what_can_be_told() -> None:
     errors = {"mean": 9.0, "p95": 9.0, "max": 9.0}
     scores = {"phase1": errors, "phase2": errors, "chain": errors, "nodule_in_ellipsoid95": False}
+    right = {"nodule_deflated_mm": 9.9, "nodule_in_ellipsoid95": True}
     outcomes = [
-        Outcome("a", 0, 1.0, 1.0, "", [], 0, scores | {"nodule_deflated_mm": 10.1}, []),
-        Outcome("b", 0, 1.0, 1.0, "", [], 0, scores | {"nodule_deflated_mm": 9.9, "nodule_in_ellipsoid95": True}, []),
+        Outcome("a", 0, 1.0, 1.0, "", [], 0, scores | {"nodule_deflated_mm": 10.1} | _held(0.75, 40), []),
+        Outcome("b", 0, 1.0, 1.0, "", [], 0, scores | right | _held(1.0, 20), []),
         Outcome("c", 3, 1.0, 1.0, "a | b", [], None, None, []),
     ]
     assert as_json(outcomes)["coverage95"] == 0.5
     assert as_json(outcomes)["silent_failure_share"] == 0.5
     assert summary(outcomes).startswith("3 cases, 2 with exit code 0.")
+    assert "radius holds 50 of 60 landmarks" in summary(outcomes)
+    assert [case["landmarks_in_radius95"] for case in as_json(outcomes)["cases"]] == [0.75, 1.0, None]
     assert "| a / b |" in table(outcomes)
+    assert "| 30 of 40 |" in table(outcomes)
+
+
+def _held(share: float, n: int) -> dict[str, Any]:
+    return {"in_radius95": {"landmarks": {"share": share, "n": n, "median_mm": 5.0}}}
 
 
 def test_bench_fit_tells_errors_seconds_coverage_and_silent_failures(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from vatsloc.case import sha256
 from vatsloc.errors import CaseError, InputRefused
 from vatsloc.evaluation import evaluate_case, table
 from vatsloc.formats.markups import PointList, write_points
-from vatsloc.formats.meshes import Surface, TetraMesh, write_vtu
+from vatsloc.formats.meshes import Surface, TetraMesh, read_vtu, write_vtu
 from vatsloc.formats.nifti import write_volume
 from vatsloc.frames import flip_points
 from vatsloc.report.render import SCORES_FROM, SCORES_TO
@@ -86,6 +87,7 @@ def write_result(result, grid, image):
         "converged", flip_points(nodule), np.array([2.5, 1, 1]), {"phi": 0.5}, {"total": 1.0}, 1.0, details=details
     )
     meshes = [TetraMesh(points, lung.tets) for points in (lung.points, inflated, deflated)]
+    meshes[2] = replace(meshes[2], point_data={"radius95_mm": 5 + 0.2 * lung.points[:, 0]})
     rigid = (RIGID1.matrix, RIGID2.matrix)
     mask = Mask(grid.points()[..., 0] > 0, grid.ras_from_ijk)
     axes = dict.fromkeys(("ct", "cbct_inflated", "cbct_deflated"), "RAS")
@@ -121,6 +123,28 @@ def test_nodule_error_and_ellipsoid(folders):
     assert_allclose(scores["nodule_deflated_mm"], 2.0, atol=1e-6)
     assert scores["nodule_inflated_mm"] is None
     assert scores["nodule_in_ellipsoid95"] is True
+
+
+def test_landmarks_are_held_by_the_radius_that_the_result_gives_them(folders):
+    case, result = folders
+    held = evaluate_case(case, result)["in_radius95"]["landmarks"]
+    rows = list(csv.DictReader((result / "tre.csv").read_text().splitlines()))
+    radius, x = np.array([[float(row[key]) for key in ("radius95_mm", "ct_x_ras")] for row in rows]).T
+    assert_allclose(radius, 5 + 0.2 * x, atol=1e-4)
+    # 5 mm off everywhere; the first landmark has no truth in the deflated image.
+    assert held["n"] == len(CT) - 1
+    assert held["share"] == np.mean(x[1:] > 0)
+    assert held["median_mm"] == pytest.approx(np.median(radius[1:]), abs=1e-4)
+    assert f"{held['share']:.1%} of {held['n']} landmarks" in table(evaluate_case(case, result))
+
+
+def test_a_result_without_radii_is_scored_without_them(folders):
+    case, result = folders
+    lung = read_vtu(result / "lung_deflated.vtu")
+    write_vtu(result / "lung_deflated.vtu", TetraMesh(lung.points_ras, lung.tets))
+    scores = evaluate_case(case, result)
+    assert scores["in_radius95"]["landmarks"] == {"share": None, "n": 0, "median_mm": None}
+    assert "95 % radius" not in table(scores)
 
 
 def test_dense_tissue_is_scored_where_a_phantom_knows_it(folders):

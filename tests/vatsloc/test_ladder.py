@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,7 +17,6 @@ from poro.observations import Target
 from poro.tissue import Tissue
 from registration.matching import Pairs
 from vatsloc.workflow.ladder import NO_OTHERS, Model, Step, best_of, corrected, held_back, misfit
-from vatsloc.workflow.localize import place_sigma_mm, scatter
 from vatsloc.workflow.spread import other_answers
 
 GRADIENT = np.array([[-0.1, 0.02, 0.0], [0.03, -0.05, 0.04], [0.0, -0.02, 0.08]])
@@ -122,11 +120,6 @@ def test_noise_alone_is_not_worth_a_rung(still: Model) -> None:
     assert_allclose(blind.displacement, 0)
 
 
-def test_the_farther_from_a_place_found_again_the_less_sure() -> None:
-    assert place_sigma_mm(0.0) == place_sigma_mm(8.0) == pytest.approx(0.7)
-    assert place_sigma_mm(28.0) == pytest.approx(0.7 + 0.17 * 20)
-
-
 def test_other_answers_follow_the_inputs_and_agree_where_the_surface_tells_all(lung: TetMesh, still: Model) -> None:
     system = still.system
     truth = solve(system, Theta(2e-8, 0.7, 0.0))
@@ -143,12 +136,3 @@ def test_other_answers_follow_the_inputs_and_agree_where_the_surface_tells_all(l
     assert len(held) >= 4
     # Starts and halves of a surface that the model explains end where the best fit did; only the two tilts differ.
     assert sorted(np.linalg.norm(held, axis=2).max(axis=1) > 0.5) == [False] * (len(held) - 2) + [True] * 2
-
-
-def test_scatter_is_the_second_moment_of_the_other_answers(lung: TetMesh, still: Model) -> None:
-    others = np.zeros((2, len(lung.points), 3))
-    others[0, :, 0], others[1, :, 1] = 2.0, 4.0
-    model = replace(still, others=others)
-    collapse = SimpleNamespace(model=model, system=model.system)
-    assert_allclose(scatter(collapse, np.zeros(3)), np.diag([2.0, 8.0, 0.0]), atol=1e-9)
-    assert_allclose(scatter(SimpleNamespace(model=still, system=still.system), np.zeros(3)), np.zeros((3, 3)))

@@ -125,6 +125,16 @@ def test_pleural_gas_takes_the_place_of_the_lung(case: Path, result: Path) -> No
     assert -930 < np.median(warped.hu[lung]) < -700
 
 
+def test_how_sure_the_run_is_stands_on_every_node_and_agrees_at_the_nodule(result: Path, run: dict[str, Any]) -> None:
+    lung = read_vtu(result / "lung_deflated.vtu")
+    radius = lung.point_data["radius95_mm"]
+    assert np.isfinite(radius).all()
+    assert radius.min() > 1
+    near = np.linalg.norm(lung.points_ras * [-1, -1, 1] - run["nodule_lps"], axis=1) < 12
+    assert radius[near].min() <= 1.1 * run["nodule_ellipsoid95_mm"][0]
+    assert radius[near].max() >= 0.9 * run["nodule_ellipsoid95_mm"][0]
+
+
 def test_nodule_mask_covers_the_nodule_once(case: Path, result: Path) -> None:
     found, truth = (
         read_mask(result / "nodule_cbct_deflated.nii.gz"),

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from poro.mesh import locate
+from poro.mesh import interpolate, locate
 from registration.volume import Array
 from vatsloc.evaluation.ellipsoid import in_ellipsoid
 from vatsloc.evaluation.inputs import (
@@ -36,13 +36,16 @@ from vatsloc.results import REPORT
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Scores of one result. depth_mm: (n,) below the pleura of the CT; inside_*: (n,) bool; summary: for tre.json."""
+    """Scores of one result. depth_mm: (n,) below the pleura of the CT; inside_*: (n,) bool; radius95_mm: (n,) how
+    far off the run holds a landmark to be at most (95 %), NaN where it does not say; summary: for tre.json.
+    """
 
     landmarks: LandmarkTriples
     errors: Errors
     depth_mm: Array
     inside_fov: Array
     inside_mesh: Array
+    radius95_mm: Array
     summary: dict[str, Any]
 
 
@@ -84,9 +87,14 @@ def evaluate(truth: Truth, result: Result) -> Evaluation:
     }
     summary["inside_fov"] = {m: asdict(summarize(errors.mm[m][inside_fov])) for m in BEFORE}
     summary["by_depth"] = {m: _strata(errors.mm[m], depth) for m in BEFORE}
-    summary["dense"] = None if truth.dense is None else _dense(truth.dense, truth, result)
+    radius = _radius95(result, landmarks.ct)
+    summary["in_radius95"] = {"landmarks": _held(errors.mm["chain"], radius)}
+    summary["dense"] = None
+    if truth.dense is not None:
+        summary["dense"], held = _dense(truth.dense, truth, result)
+        summary["in_radius95"] |= held
     summary["warnings"] = _warnings(landmarks, inside_fov, inside_mesh, inside_field)
-    return Evaluation(landmarks, errors, depth, inside_fov, inside_mesh, _without_nan(summary))
+    return Evaluation(landmarks, errors, depth, inside_fov, inside_mesh, radius, _without_nan(summary))
 
 
 def as_csv(scores: Evaluation) -> str:
@@ -110,6 +118,7 @@ def as_csv(scores: Evaluation) -> str:
         *(f"{name}_{axis}_ras" for name in points for axis in "xyz"),
         *tre,
         "depth_mm",
+        "radius95_mm",
         "inside_fov",
         "inside_mesh",
     ]
@@ -117,24 +126,43 @@ def as_csv(scores: Evaluation) -> str:
     table = csv.writer(text, lineterminator="\n")
     table.writerow(head)
     for n, label in enumerate(scores.landmarks.labels):
-        numbers = [*(v for p in points.values() for v in p[n]), *(e[n] for e in tre.values()), scores.depth_mm[n]]
+        numbers = [*(v for p in points.values() for v in p[n]), *(e[n] for e in tre.values())]
+        numbers += [scores.depth_mm[n], scores.radius95_mm[n]]
         flags = [str(bool(flag[n])).lower() for flag in (scores.inside_fov, scores.inside_mesh)]
         table.writerow([label, *("" if math.isnan(v) else f"{v:.4f}" for v in numbers), *flags])
     return text.getvalue()
 
 
-def _dense(points: Array, truth: Truth, result: Result) -> dict[str, Any]:
-    """Errors at tissue points all over the lung, apart for those that both cone-beam CTs show and the others."""
+def _dense(points: Array, truth: Truth, result: Result) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Errors at tissue points all over the lung, and how many of them are within their radius, apart for those that
+    both cone-beam CTs show and the others.
+    """
     ct, inflated, deflated = points[:, 0], points[:, 1], points[:, 2]
     seen = seen_in(truth.fields_of_view["inflated"], inflated) & seen_in(truth.fields_of_view["deflated"], deflated)
     errors = {
         "phase1": distances(result.maps.inf_from_ct(ct), inflated),
         "chain": distances(result.maps.def_from_ct(ct), deflated),
     }
-    return {
-        where: {m: asdict(summarize(e[chosen])) for m, e in errors.items()}
-        for where, chosen in (("inside_fov", seen), ("outside_fov", ~seen))
-    }
+    radius = _radius95(result, ct)
+    places = {"inside_fov": seen, "outside_fov": ~seen}
+    scores = {where: {m: asdict(summarize(e[at])) for m, e in errors.items()} for where, at in places.items()}
+    return scores, {where: _held(errors["chain"][at], radius[at]) for where, at in places.items()}
+
+
+def _radius95(result: Result, points_ct: Array) -> Array:
+    """How far off (n,) mm the run holds points (n, 3) of the CT to be at most, 95 %; NaN where it does not say."""
+    if result.radius95_mm is None:
+        return np.full(len(points_ct), np.nan)
+    return np.asarray(interpolate(locate(result.lung_ct, points_ct), result.radius95_mm))
+
+
+def _held(errors_mm: Array, radius_mm: Array) -> dict[str, Any]:
+    """Share of the points whose error is within its radius, how many have both, the radius's median in mm."""
+    known = np.isfinite(errors_mm) & np.isfinite(radius_mm)
+    if not known.any():
+        return {"share": None, "n": 0, "median_mm": None}
+    share = float((errors_mm <= radius_mm)[known].mean())
+    return {"share": share, "n": int(known.sum()), "median_mm": float(np.median(radius_mm[known]))}
 
 
 def _nodule(truth: Truth, result: Result) -> dict[str, Any]:

@@ -33,6 +33,7 @@ from vatsloc.results import (
     LUNG_INFLATED,
     NODULE_DEFLATED,
     NODULE_INFLATED,
+    RADIUS95,
     RIGID_DEFLATED_FROM_INFLATED,
     RIGID_INFLATED_FROM_CT,
     read_run,
@@ -43,7 +44,11 @@ DENSE_FILE = "dense_ras_mm.csv"
 
 @dataclass(frozen=True)
 class Result:
-    """A results folder in memory. run: run.json; lung_ct: for depths; nodule_*_ras: (3,) predictions, RAS mm."""
+    """A results folder in memory.
+
+    run: run.json; lung_ct: for depths; nodule_*_ras: (3,) predictions, RAS mm; radius95_mm: (n,) at the lungs' nodes,
+    how far off the run holds its tissue to be at most (95 %), None in results from before it was written.
+    """
 
     run: dict[str, Any]
     maps: RunMaps
@@ -52,6 +57,7 @@ class Result:
     lung_inflated: TetMesh
     nodule_inflated_ras: Array
     nodule_deflated_ras: Array
+    radius95_mm: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -130,6 +136,7 @@ def read_result(folder: Path) -> Result:
         lung_inflated=lung_inflated,
         nodule_inflated_ras=read_points(folder / NODULE_INFLATED).ras[0],
         nodule_deflated_ras=read_points(folder / NODULE_DEFLATED).ras[0],
+        radius95_mm=deflated.point_data.get(RADIUS95),
     )
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from vatsloc.evaluation.tre import BEFORE, MEASURES
 
-_WHERE = {"inside_fov": "seen", "outside_fov": "unseen"}
+_WHERE = {"landmarks": "landmarks", "inside_fov": "tissue seen", "outside_fov": "tissue unseen"}
 _COLUMNS = ("mean", "sd", "median", "p95", "max")
 
 
@@ -22,7 +22,13 @@ def table(summary: Mapping[str, Any]) -> str:
     for where, errors in (summary.get("dense") or {}).items():
         for measure, s in errors.items():
             numbers = "".join(f"{_mm(s[c]):>8}" for c in _COLUMNS)
-            lines.append(f"{f'{measure}, tissue {_WHERE[where]}':<26}{numbers}{s['n']:>6}")
+            lines.append(f"{f'{measure}, {_WHERE[where]}':<26}{numbers}{s['n']:>6}")
+    lines += [
+        f"within their 95 % radius (median {held['median_mm']:.1f} mm): "
+        f"{held['share']:.1%} of {held['n']} {_WHERE[where]}"
+        for where, held in summary["in_radius95"].items()
+        if held["n"]
+    ]
     inside = {True: ", inside its 95 % ellipsoid", False: ", outside its 95 % ellipsoid", None: ""}
     lines.append(
         f"nodule: {_mm(summary['nodule_inflated_mm'])} mm off in the inflated CBCT, "

@@ -84,6 +84,12 @@ class Outcome:
         """Whether the 95 % ellipsoid holds the true nodule."""
         return None if self.scores is None else self.scores["nodule_in_ellipsoid95"]
 
+    @property
+    def landmarks_in_radius(self) -> tuple[int, int]:
+        """How many landmarks lie within the 95 % radius that the run gave them, and of how many that is known."""
+        held = (self.scores or {}).get("in_radius95", {}).get("landmarks", {})
+        return (round(held["share"] * held["n"]), held["n"]) if held.get("n") else (0, 0)
+
     def phase(self, name: str, statistic: str) -> float | None:
         """A statistic of the landmark errors of "phase1", "phase2" or "chain", mm."""
         return None if self.scores is None else self.scores[name][statistic]
@@ -189,6 +195,7 @@ def summary(outcomes: Sequence[Outcome]) -> str:
     return (
         f"{len(outcomes)} cases, {sum(o.exit_code == 0 for o in outcomes)} with exit code 0. "
         f"The 95 % ellipsoid holds the nodule in {_of(held)} cases ({_of(trusted)} under exit code 0). "
+        f"Their own 95 % radius holds {_sum(outcomes)} landmarks. "
         f"Silent failures (nodule or mean landmark error over {SILENT_MM:g} mm under exit code 0): {_of(silent)}."
     )
 
@@ -205,7 +212,8 @@ def as_json(outcomes: Sequence[Outcome]) -> dict[str, Any]:
 
 
 _HEADS = (
-    "case", "exit", *_PHASES.values(), "nodule", "ellipsoid holds it", "failed gates", "s", "MB", "says"
+    "case", "exit", *_PHASES.values(), "nodule", "ellipsoid holds it", "landmarks in their 95 % radius",
+    "failed gates", "s", "MB", "says"
 )  # fmt: skip
 
 
@@ -217,6 +225,7 @@ def _record(o: Outcome) -> dict[str, Any]:
         **errors,
         "nodule_mm": o.nodule_mm,
         "nodule_in_ellipsoid95": o.nodule_in_ellipsoid,
+        "landmarks_in_radius95": _share(o.landmarks_in_radius),
         "silent_failure": o.silent_failure,
         "failed_gates": " ".join(o.failed_gates),
         "seconds": round(o.seconds, 1),
@@ -229,7 +238,8 @@ def _cells(o: Outcome) -> list[str]:
     phases = [" / ".join(_number(o.phase(phase, s)) for s in _STATISTICS) if o.scores else "" for phase in _PHASES]
     held = {None: "", True: "yes", False: "no"}[o.nodule_in_ellipsoid]
     says = "" if o.failed_gates else o.says.replace("|", "/")
-    tail = [", ".join(o.failed_gates), f"{o.seconds:.0f}", f"{o.peak_mb:.0f}", says]
+    radius = "{} of {}".format(*o.landmarks_in_radius) if o.landmarks_in_radius[1] else ""
+    tail = [radius, ", ".join(o.failed_gates), f"{o.seconds:.0f}", f"{o.peak_mb:.0f}", says]
     return [o.name, str(o.exit_code), *phases, _number(o.nodule_mm), held, *tail]
 
 
@@ -239,6 +249,15 @@ def _number(value: float | None) -> str:
 
 def _of(flags: Sequence[bool]) -> str:
     return f"{sum(flags)} of {len(flags)}"
+
+
+def _share(counts: tuple[int, int]) -> float | None:
+    return counts[0] / counts[1] if counts[1] else None
+
+
+def _sum(outcomes: Sequence[Outcome]) -> str:
+    counts = [o.landmarks_in_radius for o in outcomes]
+    return f"{sum(held for held, _ in counts)} of {sum(known for _, known in counts)}"
 
 
 def _in_order(jobs: Sequence[Job], done: dict[str, Outcome]) -> list[Outcome]:

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from poro.fit import CHI2_95_3D, FitStatus, ellipsoid95
-from poro.mesh import closest_points, interpolate, locate
+from poro.fit import FitStatus, ellipsoid95
+from poro.mesh import closest_points
 from poro.mesh.tetmesh import signed_volumes
 from poro.model import PoroStatus
 from registration.spine import RigidFit
@@ -17,6 +17,7 @@ from vatsloc.case import Case
 from vatsloc.errors import NotConverged
 from vatsloc.imaging.surface import Border
 from vatsloc.maps import MeshMap
+from vatsloc.workflow.certainty import covariance
 from vatsloc.workflow.gates import Gate, at_least, at_most
 from vatsloc.workflow.hilum import HilumSource
 from vatsloc.workflow.pneumothorax import Collapse, pneumothorax
@@ -24,14 +25,6 @@ from vatsloc.workflow.pose import ChangeOfPose, change_of_pose
 from vatsloc.workflow.prepare import Prepared, prepare
 from vatsloc.workflow.settings import GateSettings, Settings
 from vatsloc.workflow.stages import Stages
-
-REGISTRATION_MM = 0.5
-"""Standard deviation per axis of one registration where it holds: a quarter of its finest voxel."""
-MODEL_ALONE_MM = 4.0
-"""The same of the model without images inside the lung: 1.7 to 6.9 mm on twins and phantoms."""
-FOUND_MM, FOUND_REACH_MM, FOUND_SLOPE = 0.7, 8.0, 0.17
-"""The same of tissue near a place that was found again, how far that holds, and by how much it grows per millimetre
-beyond: an upper bound over the dense truth of the three twins and two phantoms (small-right 4, small-left 3)."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +83,7 @@ def conclude(
     rigid = collapse.def_from_inf_rigid
     moved = MeshMap(pose.mesh_inf, collapse.mesh_after.points, rigid)
     nodule_def = moved(nodule_inf[None])[0]
-    lengths, axes = nodule_ellipsoid(pose, collapse, nodule_inf, nodule_def)
+    (lengths,), (axes,) = ellipsoid95(covariance(pose, collapse, nodule_inf[None], nodule_def[None]))
     gates = quality_gates(pose, collapse, settings.gates)
     gates["ellipsoid"] = at_most(
         lengths[0], settings.gates.max_ellipsoid_mm, "The nodule's position is too uncertain for a wedge resection."
@@ -114,51 +107,6 @@ def in_view(shown: Mapping[str, tuple[Mask, Array]], limit_mm: float, stages: St
                 "so its place there is the model's alone."
             )
     return at_most(max(out_mm.values()), limit_mm, "The nodule lies far out of a CBCT's view.")
-
-
-def nodule_ellipsoid(
-    pose: ChangeOfPose, collapse: Collapse, nodule_inf: Array, nodule_def: Array
-) -> tuple[Array, Array]:
-    """Semi-axes (3,) mm, longest first, and their directions (3, 3) in rows, that hold the nodule with 95 %.
-
-    Where the images placed the tissue around the nodule, their registrations' errors and disagreement count; where they
-    did not, the fit's covariance and the scatter of other answers. Either way it is no surer than the distance to the
-    nearest place found again allows.
-    """
-    point = collapse.def_from_inf_rigid(nodule_inf[None])[0]
-    residual, pairs = collapse.residual, collapse.model.pairs
-    least_mm, model_mm = 0.0, MODEL_ALONE_MM
-    if collapse.model.rungs:
-        least_mm = model_mm = place_sigma_mm(float(np.linalg.norm(pairs.second - nodule_def, axis=1).min()))
-    lengths, directions = ellipsoid95(collapse.fit, collapse.system, point, model_mm)
-    covariance = (directions * (lengths**2 / CHI2_95_3D)) @ directions.T + scatter(collapse, point)
-    if residual is None:
-        return _semi_axes(covariance)
-    at = locate(pose.mesh_inf, nodule_inf[None])
-    trust = float(interpolate(at, residual.seen.astype(float))[0])
-    disagreement = float(interpolate(at, np.where(residual.seen, residual.disagreement_mm, 0.0))[0])
-    known = max(2 * REGISTRATION_MM**2 + (disagreement / 2) ** 2, least_mm**2)
-    return _semi_axes(trust * known * np.eye(3) + (1 - trust) * covariance)
-
-
-def scatter(collapse: Collapse, point: Array) -> Array:
-    """Second moment (3, 3) mm2 of other answers about the one given, at a point (3,) before the collapse."""
-    others = collapse.model.others
-    if not len(others):
-        return np.zeros((3, 3))
-    at = locate(collapse.system.mesh, point[None])
-    off = np.array([interpolate(at, other)[0] for other in others])
-    return np.asarray(off.T @ off / len(off))
-
-
-def _semi_axes(covariance: Array) -> tuple[Array, Array]:
-    values, vectors = np.linalg.eigh(covariance)
-    return np.sqrt(CHI2_95_3D * values[::-1]), vectors[:, ::-1].T
-
-
-def place_sigma_mm(distance_mm: float) -> float:
-    """Standard deviation per axis of tissue at a distance from the nearest place found again."""
-    return FOUND_MM + FOUND_SLOPE * max(distance_mm - FOUND_REACH_MM, 0.0)
 
 
 def quality_gates(pose: ChangeOfPose, collapse: Collapse, limits: GateSettings) -> dict[str, Gate]:

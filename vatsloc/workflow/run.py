@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +22,10 @@ from vatsloc.maps import covered, sampled
 from vatsloc.report.collect import report_data
 from vatsloc.report.data import LUNG, SURFACE, Outline, Picture
 from vatsloc.report.render import write_report
-from vatsloc.results import OUTPUT_FILES, REPORT, SCENE, ResultData, RunRecord, write_results
+from vatsloc.results import OUTPUT_FILES, RADIUS95, REPORT, SCENE, ResultData, RunRecord, write_results
 from vatsloc.scene import write_result_scene
-from vatsloc.workflow.localize import Localization, localize, scatter, surface_distances
+from vatsloc.workflow.certainty import radius95, scatter
+from vatsloc.workflow.localize import Localization, localize, surface_distances
 from vatsloc.workflow.pneumothorax import contact_surface
 from vatsloc.workflow.pose import ChangeOfPose
 from vatsloc.workflow.residual import Residual
@@ -100,7 +101,7 @@ def _result(case: Case, found: Localization, fields: _Fields, run: RunRecord) ->
         ct_in_deflated=_ct_in_deflated(case, found, fields),
         lung_ct=_tetra(pose.mesh_ct, np.zeros_like(pose.points_inf), none, np.ones(len(pose_det)), none),
         lung_inflated=_tetra(pose.mesh_inf, pose.points_inf - pose.mesh_ct.points, none, pose_det, none),
-        lung_deflated=_tetra(after, after.points - pose.points_inf, pressure, det_f, contact),
+        lung_deflated=_with_radius95(found, _tetra(after, after.points - pose.points_inf, pressure, det_f, contact)),
         deflated_surface=Surface(outer.points, outer.triangles),
         contact_surface=Surface(cage.points, cage.triangles),
         inflated_from_ct=fields.inflated_from_ct,
@@ -118,6 +119,11 @@ def _tetra(mesh: TetMesh, displacement: Array, pressure: Array, det_f: Array, co
     """A state of the lung for viewers: mm, kPa."""
     nodal = {"displacement": displacement, "pressure_kpa": pressure, "contact_pressure_kpa": contact}
     return TetraMesh(mesh.points, mesh.tets, nodal, {"det_f": det_f})
+
+
+def _with_radius95(found: Localization, lung: TetraMesh) -> TetraMesh:
+    """With how sure the run is of each node."""
+    return replace(lung, point_data={**lung.point_data, RADIUS95: radius95(found.pose, found.collapse)})
 
 
 def _lung_box(lung: Mask) -> Grid:
@@ -219,8 +225,8 @@ def _residuals(found: Localization) -> dict[str, Any]:
 
 def _scatter_mm(found: Localization) -> float:
     """Root mean square distance in mm between the nodule's place and those of other answers."""
-    point = found.collapse.def_from_inf_rigid(found.nodule_inf[None])[0]
-    return float(np.sqrt(np.trace(scatter(found.collapse, point))))
+    point = found.collapse.def_from_inf_rigid(found.nodule_inf[None])
+    return float(np.sqrt(np.trace(scatter(found.collapse, point)[0])))
 
 
 def _spine(fit: RigidFit) -> dict[str, Any]:

@@ -1,0 +1,63 @@
+"""How sure a run is of where tissue went, at the nodule and everywhere else in the lung."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from poro.fit import ellipsoid95, point_covariance
+from poro.mesh import interpolate, locate
+from registration.volume import Array
+from vatsloc.workflow.pneumothorax import Collapse
+from vatsloc.workflow.pose import ChangeOfPose
+
+REGISTRATION_MM = 0.5
+"""Standard deviation per axis of one registration where it holds: a quarter of its finest voxel."""
+MODEL_ALONE_MM = 4.0
+"""The same of the model without images inside the lung: 1.7 to 6.9 mm on twins and phantoms."""
+FOUND_MM, FOUND_REACH_MM, FOUND_SLOPE = 0.7, 8.0, 0.17
+"""The same of tissue near a place that was found again, how far that holds, and by how much it grows per millimetre
+beyond: an upper bound over the dense truth of the three twins and two phantoms (small-right 4, small-left 3)."""
+
+
+def covariance(pose: ChangeOfPose, collapse: Collapse, inflated: Array, deflated: Array) -> Array:
+    """Covariance (n, 3, 3) mm2 of where points (n, 3) of the inflated CBCT lie in the deflated one, given with where
+    the run puts them (n, 3).
+
+    Where the images placed the tissue around a point, their registrations' errors and disagreement count; where they
+    did not, the fit's covariance and the scatter of other answers. Either way it is no surer than the distance to the
+    nearest place found again allows.
+    """
+    points = collapse.def_from_inf_rigid(inflated)
+    residual, pairs = collapse.residual, collapse.model.pairs
+    least_mm, model_mm = np.zeros(len(points)), np.full(len(points), MODEL_ALONE_MM)
+    if collapse.model.rungs:
+        least_mm = model_mm = place_sigma_mm(cKDTree(pairs.second).query(deflated)[0])
+    modelled = point_covariance(collapse.fit, collapse.system, points, model_mm) + scatter(collapse, points)
+    if residual is None:
+        return modelled
+    at = locate(pose.mesh_inf, inflated)
+    trust = interpolate(at, residual.seen.astype(float))
+    disagreement = interpolate(at, np.where(residual.seen, residual.disagreement_mm, 0.0))
+    known = np.maximum(2 * REGISTRATION_MM**2 + (disagreement / 2) ** 2, least_mm**2)
+    return np.asarray((trust * known)[:, None, None] * np.eye(3) + (1 - trust)[:, None, None] * modelled)
+
+
+def radius95(pose: ChangeOfPose, collapse: Collapse) -> Array:
+    """Longest semi-axis (n,) mm of the ellipsoid that holds the tissue of each of the lung's nodes with 95 %."""
+    return ellipsoid95(covariance(pose, collapse, pose.points_inf, collapse.mesh_after.points))[0][:, 0]
+
+
+def scatter(collapse: Collapse, points: Array) -> Array:
+    """Second moment (n, 3, 3) mm2 of other answers about the one given, at points (n, 3) before the collapse."""
+    others = collapse.model.others
+    if not len(others):
+        return np.zeros((len(points), 3, 3))
+    at = locate(collapse.system.mesh, points)
+    off = np.array([interpolate(at, other) for other in others])
+    return np.asarray(np.einsum("oni,onj->nij", off, off) / len(off))
+
+
+def place_sigma_mm(distance_mm: Array) -> Array:
+    """Standard deviation (n,) per axis of tissue at distances (n,) from the nearest place found again."""
+    return FOUND_MM + FOUND_SLOPE * np.maximum(distance_mm - FOUND_REACH_MM, 0.0)
