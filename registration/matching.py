@@ -66,10 +66,10 @@ def match_keypoints(
     """
     settings = settings or MatchSettings()
     grid = second.grid.with_spacing(settings.voxel_mm)
-    here, there = _smooth(resample(second, grid)), _smooth(resample(first, grid))
+    here, there = smoothed(resample(second, grid)), smoothed(resample(first, grid))
     allowed = resample_mask(region, grid).inside
     believed = np.ones(grid.shape, bool) if first_region is None else resample_mask(first_region, grid).inside
-    starts = _distinctive(here, allowed, settings)
+    starts = distinctive_places(here, allowed, settings)
     reach = round(settings.reach_mm / settings.voxel_mm)
     ends, ncc = _search(here, there, starts, believed, settings.radius, reach)
     found = np.flatnonzero(ncc >= settings.least_ncc)
@@ -103,11 +103,11 @@ def distinctiveness(hu: Array, spacing: Array) -> Array:
     return np.asarray(np.maximum(det, 0) / np.maximum(minors, 1e-6))
 
 
-def _smooth(volume: Volume) -> Volume:
+def smoothed(volume: Volume) -> Volume:
     return Volume(ndimage.gaussian_filter(volume.hu, 0.5), volume.ras_from_ijk)
 
 
-def _distinctive(image: Volume, allowed: Array, settings: MatchSettings) -> Array:
+def distinctive_places(image: Volume, allowed: Array, settings: MatchSettings) -> Array:
     """Voxels (n, 3), the most distinctive one of every cell, a block away from the image's border."""
     score = np.where(allowed, distinctiveness(image.hu, image.grid.spacing), 0)
     edge = settings.radius + 1
@@ -134,12 +134,12 @@ def _search(
     thin_f, thin_m = (ndimage.gaussian_filter(hu, THIN_BLUR) for hu in (f, m))
     starts = np.ascontiguousarray(starts, np.int64)
     _blocks(f, m, thin_f, thin_m, starts, believed, radius, reach, best, around)
-    offset, is_top = _between(around)
+    offset, is_top = between_voxels(around)
     is_top &= (np.abs(best) < reach).all(axis=1)
     return starts + best + offset, np.where(is_top, around[:, 13], -1)
 
 
-def _between(around: Array) -> tuple[Array, Array]:
+def between_voxels(around: Array) -> tuple[Array, Array]:
     """Offset (n, 3) in voxels of the top of the quadric through the 27 scores (n, 27) about each highest one, in C
     order, and whether it is a top: not on the border of the search or of the image.
     """

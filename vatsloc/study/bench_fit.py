@@ -15,7 +15,7 @@ from vatsloc.study.cohort import as_json as cohort_json
 from vatsloc.study.tables import markdown
 from vatsloc.workflow.stages import Say, quiet
 
-FIT_STAGES = ("model set-up", "fit", "keypoints", "regional fit", "keypoints again", "elastic correction")
+FIT_STAGES = ("model set-up", "fit", "keypoints", "regional fit", "elastic correction")
 """What of a run is the inverse problem, by the names of run.json."""
 
 

@@ -21,17 +21,16 @@ from poro.model import PoroStatus, PoroSystem, assemble
 from poro.modes import hilum_modes, shape_modes
 from poro.observations import Target
 from poro.tissue import Tissue
-from registration.matching import MatchSettings, Pairs, match_keypoints
+from registration.matching import Pairs
 from registration.volume import Array
 from vatsloc.imaging.surface import Border, SurfacePoints
-from vatsloc.maps import MeshMap
 from vatsloc.workflow.choices import Choice
 from vatsloc.workflow.observe import Observed
+from vatsloc.workflow.places import inner_pairs
 from vatsloc.workflow.prepare import Prepared
-from vatsloc.workflow.settings import KeypointSettings, Settings
+from vatsloc.workflow.settings import Settings
 from vatsloc.workflow.spread import other_answers
 from vatsloc.workflow.stages import Stages
-from vatsloc.workflow.view import view_of
 
 BLOCK_MM = 40.0
 """Keypoints are held back by blocks this wide: neighbours tell nearly the same."""
@@ -122,11 +121,7 @@ def _rungs(
         with stages.stage("regional fit"):
             steps = {"regional fit": _regional(model.system.gravity, settings)}
             model, blind = best_of(steps, model, blind, surface)
-        if any(rung.kept for rung in model.rungs):
-            with stages.stage("keypoints again"):
-                pairs = inner_pairs(prepared, observed, model.displacement, settings.keypoints)
-                model, blind = replace(model, pairs=pairs), replace(blind, pairs=pairs)
-    if settings.model.correct and not _too_few(model.pairs):
+    if settings.model.correct:
         with stages.stage("elastic correction"):
             steps = {f"elastic correction, strain {strain:g}": corrected(strain) for strain in CORRECTION_STRAINS}
             model, blind = best_of(steps, model, blind, surface)
@@ -168,25 +163,6 @@ def _too_few(pairs: Pairs) -> str | None:
 
 NO_PAIRS = Pairs(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
 NO_OTHERS = np.zeros((0, 0, 3))
-
-
-def inner_pairs(prepared: Prepared, observed: Observed, displacement: Array, settings: KeypointSettings) -> Pairs:
-    """Places inside the lung that both CBCTs show, looked for about where a displacement (n, 3) mm puts them.
-
-    `first` is where they lie before the collapse, placed by the spine.
-    """
-    rest, rigid = observed.model_mesh, observed.def_from_inf_rigid
-    before = TetMesh(rigid.inverse()(rest.points), rest.tets)
-    model = MeshMap(before, rest.points + displacement, rigid)
-    view = view_of(prepared, observed.found.lung, model, settings.voxel_mm)
-    pairs = match_keypoints(
-        view.warped,
-        view.deflated,
-        view.lung,
-        MatchSettings(voxel_mm=settings.voxel_mm, reach_mm=settings.reach_mm),
-        first_region=view.modelled,
-    )
-    return Pairs(rigid(model.inverse()(pairs.first)), pairs.second, pairs.ncc)
 
 
 def held_back(points: Array) -> Array:
