@@ -12,6 +12,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from poro.mesh import TetMesh, stuff
+from registration.matching import Pairs
 from registration.rigid import RigidTransform
 from vatsloc.workflow.certainty import MODEL_ALONE_MM, covariance, place_sigma_mm, radius95, scatter
 
@@ -26,6 +27,7 @@ class Scene:
     seen: Any = None
     disagreement_mm: Any = None
     places: Any = None
+    missed: Any = 0.0
     others: Any = field(default_factory=lambda: np.zeros((0, 0, 3)))
 
     @property
@@ -38,7 +40,7 @@ class Scene:
         along_x = np.zeros((n, 3, 1))
         along_x[:, 0] = 1.0
         fit = SimpleNamespace(sensitivity=along_x, covariance=np.array([[4.0]]), surface_rms_mm=9, keypoint_rms_mm=9)
-        pairs = SimpleNamespace(second=self.places)
+        pairs = () if self.places is None else Pairs(self.places + self.missed, self.places, np.ones(len(self.places)))
         model = SimpleNamespace(others=self.others, pairs=pairs, rungs=() if self.places is None else ("tried",))
         corrected = SimpleNamespace(seen=self.seen, disagreement_mm=self.disagreement_mm)
         return SimpleNamespace(
@@ -47,6 +49,7 @@ class Scene:
             model=model,
             system=SimpleNamespace(mesh=self.mesh),
             fit=fit,
+            mesh_before=self.mesh,
             mesh_after=self.mesh,
         )
 
@@ -77,13 +80,22 @@ def test_where_registrations_placed_the_tissue_their_disagreement_counts(ball: T
     assert_allclose(guessed, np.diag([20.0, 16, 16]), atol=1e-9)
 
 
-def test_nothing_is_surer_than_the_distance_to_the_nearest_place_allows(ball: TetMesh) -> None:
+def test_nothing_is_surer_than_the_places_about_it_allow(ball: TetMesh) -> None:
     n = len(ball.points)
-    scene = Scene(ball, np.ones(n, bool), np.zeros(n), places=np.array([[-20.0, 0, 0]]))
+    places = np.array([[-20.0, 0, 0], [-20.0, 4, 0]])
+    scene = Scene(ball, np.ones(n, bool), np.zeros(n), places=places)
     near, far = scene.covariance([-20, 0, 0], [20, 0, 0])
     assert_allclose(near, 0.5 * np.eye(3), atol=1e-9)
-    assert_allclose(far, place_sigma_mm(np.array([40.0]))[0] ** 2 * np.eye(3), atol=1e-9)
-    assert_allclose(place_sigma_mm(np.array([0.0, 8.0, 28.0])), [0.7, 0.7, 0.7 + 0.17 * 20])
+    assert_allclose(far, (0.15 * 32) ** 2 * np.eye(3), atol=1e-9)
+    missed = Scene(ball, np.ones(n, bool), np.zeros(n), places=places, missed=np.array([[2.0, 0, 0], [0, 0, 4.0]]))
+    near, far = missed.covariance([-20, 0, 0], [20, 0, 0])
+    assert_allclose(near, (1.5 * 3) ** 2 * np.eye(3), atol=1e-9)
+    assert_allclose(far, (1.5 * 3 + 0.15 * 32) ** 2 * np.eye(3), atol=1e-9)
+
+
+def test_sigma_grows_with_misfit_and_beyond_reach_with_distance() -> None:
+    distances, misfits = np.array([0.0, 8.0, 28.0, 0.0]), np.array([0.5, 0.5, 0.5, 2.0])
+    assert_allclose(place_sigma_mm(distances, misfits), [0.75, 0.75, 0.75 + 0.15 * 20, 3.0])
 
 
 def test_scatter_is_the_second_moment_of_the_other_answers(ball: TetMesh) -> None:
