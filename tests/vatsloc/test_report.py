@@ -237,6 +237,7 @@ def scores(**changes):
     summary = dict.fromkeys(MEASURE_NAMES, one)
     depth = {"chain": [{"from_mm": 0.0, "to_mm": 10.0, **one}, {"from_mm": 10.0, "to_mm": None, **one}]}
     summary |= {"nodule_inflated_mm": None, "nodule_deflated_mm": 2.7, "nodule_in_ellipsoid95": False}
+    summary |= {"in_radius95": {"landmarks": {"share": 0.75, "n": 40, "median_mm": 4.25}}}
     summary |= {"wilcoxon_p": {"chain": 1e-6}, "by_depth": depth, "warnings": ["Two <landmarks> left out."]}
     return TreSection(summary | changes, {m: np.array([1.0, 2, 4, np.nan]) for m in MEASURE_NAMES})
 
@@ -248,12 +249,15 @@ def test_scores_are_written_into_the_page_and_over_older_ones(page):
     assert parser.open == []
     assert filled.count("3.21") == 6 + 2
     assert "2.70 mm off, outside the 95 % ellipsoid" in filled
+    assert "30 of 40 (median radius 4.2 mm)" in filled
     assert "&lt; 0.001" in filled
     assert "Two &lt;landmarks&gt;" in filled
     again = with_scores(filled, scores(nodule_deflated_mm=9.87))
     assert "9.87 mm off" in again
     assert "2.70 mm off" not in again
     assert with_scores(again, scores()) == filled
+    untold = {"landmarks": {"share": None, "n": 0, "median_mm": None}}
+    assert "95 % radius" not in with_scores(page, scores(in_radius95=untold))
 
 
 def test_page_without_a_place_for_scores_is_refused():
