@@ -32,10 +32,10 @@ SCENES = {
         lesion=Lesion(place="base", depth=12.0),
         view=(0.0, 0.0, 50.0),
         scanner=Scanner(length=150.0),
-        collapse=Collapse(inflated=0.80, deflated=0.5, dome_rise=12.0, shift=14.0),
+        collapse=Collapse(inflated=0.80, deflated=0.5, dome_rise=12.0, shift=14.0, patchiness=1.8),
     ),
 }
-"""A lung that hardly moves, all in view, and one that moves much, its base with the nodule out of view."""
+"""A lung that hardly moves, all in view, and one that moves much and unevenly, its base with the nodule out of view."""
 FAST = {"registration": {"grid_mm": 20.0, "levels": 3, "voxel_mm": 3.0}, "mesh": {"edge_mm": 10.0}}
 NEEDLESS_MM = 0.5
 
