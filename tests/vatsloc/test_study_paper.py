@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from vatsloc.errors import InputRefused
 from vatsloc.study import paper
 from vatsloc.study.paper import CaseRuns, Run, read_runs, run_paper, settings_for
 from vatsloc.study.paper_draw import page
@@ -59,6 +60,21 @@ def test_what_was_run_is_kept_and_read_again(tmp_path: Path, monkeypatch: pytest
     monkeypatch.setattr(paper, "measure_case", lambda folder: pytest.fail(f"{folder} is run again"))
     (tmp_path / "cases" / "kept").mkdir(parents=True)
     assert run_paper([tmp_path / "cases" / "kept"], tmp_path) == [kept]
+
+
+def test_a_case_that_is_refused_has_no_answer_and_stops_no_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object) -> None:
+        raise InputRefused("too little is seen")
+
+    for name in ("read_case", "read_truth"):
+        monkeypatch.setattr(paper, name, lambda folder: folder)
+    monkeypatch.setattr(paper, "prepare", refuse)
+    found = paper.measure_case(tmp_path / "dark")
+    assert {run.failed for run in found.runs} == {"too little is seen"}
+    assert len(found.runs) == len(paper.VARIANTS) * len(paper.KINDS)
+    assert "- dark, vatsloc, C: too little is seen" in page([found])
 
 
 def test_landmarks_without_truth_stay_unknown(tmp_path: Path) -> None:

@@ -102,9 +102,15 @@ def read_runs(file: Path) -> CaseRuns:
 
 
 def measure_case(folder: Path) -> CaseRuns:
-    """All variants on one case; what is prepared or observed alike is so once."""
+    """All variants on one case; what is prepared or observed alike is so once. A case whose images are refused has
+    failed in all of them.
+    """
     case, truth = read_case(folder), read_truth(folder)
-    prepared = prepare(case, Stages())
+    try:
+        prepared = prepare(case, Stages())
+    except VatslocError as error:
+        refused = tuple(Run(kind, variant, failed=str(error)) for variant in VARIANTS for kind in KINDS)
+        return CaseRuns(folder.resolve().name, refused)
     poses: dict[bool, ChangeOfPose] = {}
     seen: dict[tuple[bool, bool], Observed] = {}
     runs: list[Run] = []
