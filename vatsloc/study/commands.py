@@ -155,6 +155,20 @@ def stability_fit_command(
     print(out / "tables.md")
 
 
+@stability.command("faults")
+def stability_faults_command(
+    cases: Annotated[list[Path], typer.Argument(metavar="CASES...", help="Case folders with landmarks.")],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for tables.md.")],
+    preset: Annotated[str, typer.Option(help="Preset of the runs.")] = "balanced",
+) -> None:
+    """Whole run: shifts, turns, a slipped vertebra, swapped and strange scans put in; whether the run notices."""
+    from vatsloc.study.stability_faults import stability_faults
+    from vatsloc.workflow.settings import load_settings
+
+    stability_faults(cases, out, load_settings(preset, None), say)
+    print(out / "tables.md")
+
+
 @stability.command("choices")
 def stability_choices_command(
     cases: Annotated[list[Path], typer.Argument(metavar="CASES...", help="Case folders.")],

@@ -25,7 +25,7 @@ from vatsloc.study.cohort import SILENT_MM
 from vatsloc.study.stability_fit_draw import draw_disturbed
 from vatsloc.study.tables import Row, markdown
 from vatsloc.workflow.ladder import fit_settings, surface_target
-from vatsloc.workflow.localize import conclude
+from vatsloc.workflow.localize import Localization, checked, conclude
 from vatsloc.workflow.observe import Observed, observe
 from vatsloc.workflow.pneumothorax import collapse
 from vatsloc.workflow.pose import ChangeOfPose, change_of_pose
@@ -60,7 +60,7 @@ def stability_fit(cases: Sequence[Path], out: Path, settings: Settings, say: Say
     require_matplotlib()
     tables: dict[str, list[Row]] = {"disturbed": [], "starts": [], "identifiability": []}
     for folder in cases:
-        scene = _scene(folder, settings)
+        scene = read_scene(folder, settings)
         out.mkdir(parents=True, exist_ok=True)
         name = folder.resolve().name
         for what, disturb in DISTURBANCES.items():
@@ -84,12 +84,10 @@ def disturbed(scene: Scene, disturb: Disturb) -> Row:
         stages = Stages()
         found = collapse(wrong.case, wrong.prepared, wrong.pose, wrong.observed, scene.settings, stages)
         answer = conclude(wrong.case, wrong.prepared, wrong.pose, found, scene.settings, stages)
+        answer = checked(wrong.case, answer, scene.settings)
     except VatslocError as error:
         return {"landmarks_mm": "", "nodule_mm": "", "flagged": type(error).__name__, "silent": False}
-    known, nodule = scene.truth.landmarks, scene.truth.nodule.nodule_deflated_ras
-    errors = np.linalg.norm(answer.def_from_ct(known.ct) - known.deflated, axis=1)
-    mean = float(np.nanmean(errors))
-    off = None if nodule is None else float(np.linalg.norm(answer.nodule_def - nodule))
+    mean, off = errors_mm(answer, scene.truth)
     flagged = [name for name, gate in answer.gates.items() if not gate.ok]
     silent = not flagged and max(mean, off or 0.0) > SILENT_MM
     return {
@@ -98,6 +96,13 @@ def disturbed(scene: Scene, disturb: Disturb) -> Row:
         "flagged": ", ".join(flagged),
         "silent": silent,
     }
+
+
+def errors_mm(answer: Localization, truth: Truth) -> tuple[float, float | None]:
+    """Errors in mm of the chain, at landmarks on average and at the nodule; None where that is not known."""
+    known, nodule = truth.landmarks, truth.nodule.nodule_deflated_ras
+    mean = float(np.nanmean(np.linalg.norm(answer.def_from_ct(known.ct) - known.deflated, axis=1)))
+    return mean, None if nodule is None else float(np.linalg.norm(answer.nodule_def - nodule))
 
 
 def random_starts(system: PoroSystem, target: Target, settings: Settings, count: int = STARTS) -> Row:
@@ -176,7 +181,8 @@ def page(tables: dict[str, list[Row]]) -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def _scene(folder: Path, settings: Settings) -> Scene:
+def read_scene(folder: Path, settings: Settings) -> Scene:
+    """A case folder with its truth, run up to its observations."""
     case, stages = read_case(folder), Stages()
     prepared = prepare(case, stages)
     pose = change_of_pose(case, prepared, settings, stages)
@@ -213,7 +219,7 @@ def _missing(share: float) -> Disturb:
 
     def disturb(scene: Scene, rng: np.random.Generator) -> Scene:
         surface = scene.observed.surface
-        along = surface.points @ _direction(rng)
+        along = surface.points @ direction(rng)
         keep = along >= np.quantile(along, share)
         parts = (surface.points, surface.normals, surface.confidence, surface.border)
         return _with(scene, surface=type(surface)(*(part[keep] for part in parts)))
@@ -224,7 +230,7 @@ def _missing(share: float) -> Disturb:
 def _tilted_gravity(degrees: float) -> Disturb:
     def disturb(scene: Scene, rng: np.random.Generator) -> Scene:
         gravity = scene.case.gravity_ras
-        axis = np.cross(gravity, _direction(rng))
+        axis = np.cross(gravity, direction(rng))
         turn = RigidTransform.about(np.zeros(3), np.radians(degrees) * axis / np.linalg.norm(axis), np.zeros(3))
         return replace(scene, case=replace(scene.case, gravity_ras=turn(gravity[None])[0]))
 
@@ -234,12 +240,12 @@ def _tilted_gravity(degrees: float) -> Disturb:
 def _hilum_off(mm: float) -> Disturb:
     def disturb(scene: Scene, rng: np.random.Generator) -> Scene:
         motion = scene.observed.motion
-        return _with(scene, motion=replace(motion, displacement=motion.displacement + mm * _direction(rng)))
+        return _with(scene, motion=replace(motion, displacement=motion.displacement + mm * direction(rng)))
 
     return disturb
 
 
-def _slipped_spine(scene: Scene, _rng: np.random.Generator) -> Scene:
+def slipped_spine(scene: Scene, _rng: np.random.Generator) -> Scene:
     """The collapse's spine registered one vertebra too high; everything after it is observed again."""
     rigid = scene.observed.rigid
     slip = RigidTransform.about(np.zeros(3), np.zeros(3), np.array([0.0, 0.0, VERTEBRA_MM]))
@@ -252,7 +258,8 @@ def _with(scene: Scene, **changes: object) -> Scene:
     return replace(scene, observed=replace(scene.observed, **changes))  # type: ignore[arg-type]
 
 
-def _direction(rng: np.random.Generator) -> Array:
+def direction(rng: np.random.Generator) -> Array:
+    """A random direction (3,)."""
     x = rng.normal(size=3)
     return np.asarray(x / np.linalg.norm(x))
 
@@ -265,5 +272,5 @@ DISTURBANCES: dict[str, Disturb] = {
     "surface 80 % missing": _missing(0.8),
     "gravity off 30 degrees": _tilted_gravity(30.0),
     "hilum off 10 mm": _hilum_off(10.0),
-    "spine off one vertebra": _slipped_spine,
+    "spine off one vertebra": slipped_spine,
 }

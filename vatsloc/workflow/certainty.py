@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from poro.fit import ellipsoid95, point_covariance
+from poro.fit import CHI2_95_3D, ellipsoid95, point_covariance
 from poro.mesh import interpolate, locate
+from registration.verification import LeftOver
 from registration.volume import Array
 from vatsloc.workflow.pneumothorax import Collapse
 from vatsloc.workflow.pose import ChangeOfPose
@@ -22,14 +23,37 @@ chain's errors at 16,000 tissue points of the three twins and of five phantoms o
 near-total-collapse 206, part-solid 207, base 208, poor-dose 209)."""
 
 
-def covariance(pose: ChangeOfPose, collapse: Collapse, inflated: Array, deflated: Array) -> Array:
+CHECK_REACH_MM = 30.0
+"""What the run's check of itself found left over counts for tissue within this distance."""
+
+
+def covariance(
+    pose: ChangeOfPose, collapse: Collapse, inflated: Array, deflated: Array, left: LeftOver | None = None
+) -> Array:
     """Covariance (n, 3, 3) mm2 of where points (n, 3) of the inflated CBCT lie in the deflated one, given with where
     the run puts them (n, 3).
 
     Where the images placed the tissue around a point, their registrations' errors and disagreement count; where they
     did not, the fit's covariance and the scatter of other answers. Either way it is no surer than the places
-    found again about it allow: how far they are, and how well the answer follows them.
+    found again about it allow: how far they are, and how well the answer follows them. left: what the run's check of
+    itself found left over of the chain; where that is more than the rest allows, the covariance holds it too.
     """
+    own = _covariance(pose, collapse, inflated, deflated)
+    return own if left is None else widened(own, left.near(deflated, CHECK_REACH_MM))
+
+
+def widened(covariance: Array, vectors: Array) -> Array:
+    """Covariances (n, 3, 3) mm2 with the outer product of vectors (n, 3) mm added where their ellipsoids (95 %) do not
+    hold these; a vector that is not known (NaN) widens nothing.
+    """
+    known: Array = np.asarray(np.isfinite(vectors).all(axis=1))
+    v = np.where(known[:, None], vectors, 0.0)
+    against = np.linalg.solve(covariance, v[..., None])[..., 0]
+    beyond: Array = np.asarray((v * against).sum(axis=1) > CHI2_95_3D)
+    return np.asarray(covariance + np.where(beyond[:, None, None], v[:, :, None] * v[:, None, :], 0.0))
+
+
+def _covariance(pose: ChangeOfPose, collapse: Collapse, inflated: Array, deflated: Array) -> Array:
     points = collapse.def_from_inf_rigid(inflated)
     residual = collapse.residual
     least_mm, model_mm = np.zeros(len(points)), np.full(len(points), MODEL_ALONE_MM)
@@ -45,9 +69,9 @@ def covariance(pose: ChangeOfPose, collapse: Collapse, inflated: Array, deflated
     return np.asarray((trust * known)[:, None, None] * np.eye(3) + (1 - trust)[:, None, None] * modelled)
 
 
-def radius95(pose: ChangeOfPose, collapse: Collapse) -> Array:
+def radius95(pose: ChangeOfPose, collapse: Collapse, left: LeftOver | None = None) -> Array:
     """Longest semi-axis (n,) mm of the ellipsoid that holds the tissue of each of the lung's nodes with 95 %."""
-    return ellipsoid95(covariance(pose, collapse, pose.points_inf, collapse.mesh_after.points))[0][:, 0]
+    return ellipsoid95(covariance(pose, collapse, pose.points_inf, collapse.mesh_after.points, left))[0][:, 0]
 
 
 def scatter(collapse: Collapse, points: Array) -> Array:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from poro.fit import FitStatus, ellipsoid95
 from poro.mesh import closest_points
 from poro.mesh.tetmesh import signed_volumes
 from poro.model import PoroStatus
+from registration.resample import coarsen
 from registration.spine import RigidFit
 from registration.volume import Array, Mask
 from vatsloc.case import Case
@@ -18,6 +19,7 @@ from vatsloc.errors import NotConverged
 from vatsloc.imaging.surface import Border
 from vatsloc.maps import MeshMap
 from vatsloc.workflow.certainty import covariance
+from vatsloc.workflow.check import VOXEL_MM, Checks, check_gates, compare
 from vatsloc.workflow.gates import Gate, at_least, at_most
 from vatsloc.workflow.hilum import HilumSource
 from vatsloc.workflow.pneumothorax import Collapse, pneumothorax
@@ -32,7 +34,8 @@ class Localization:
     """Where the nodule is, and everything that says why.
 
     nodule_inf, nodule_def: (3,) RAS mm in the cone-beam CTs; ellipsoid_mm: (3,) semi-axes that hold it with 95 %,
-    longest first; ellipsoid_axes: (3, 3), their directions in rows.
+    longest first; ellipsoid_axes: (3, 3), their directions in rows; checks: what the run's check of itself found, None
+    before it.
     """
 
     prepared: Prepared
@@ -43,6 +46,7 @@ class Localization:
     ellipsoid_mm: Array
     ellipsoid_axes: Array
     gates: dict[str, Gate]
+    checks: Checks | None = None
 
     @property
     def def_from_inf(self) -> MeshMap:
@@ -70,7 +74,24 @@ def localize(case: Case, settings: Settings, stages: Stages) -> Localization:
     prepared = prepare(case, stages)
     pose = change_of_pose(case, prepared, settings, stages)
     collapse = pneumothorax(case, prepared, pose, settings, stages)
-    return conclude(case, prepared, pose, collapse, settings, stages)
+    found = conclude(case, prepared, pose, collapse, settings, stages)
+    with stages.stage("check"):
+        return checked(case, found, settings)
+
+
+def checked(case: Case, found: Localization, settings: Settings) -> Localization:
+    """The answer beside the images by eyes that took no part in it: its gates, and a wider ellipsoid where it is off by
+    more than it said.
+    """
+    ct, prepared, pose, collapse = coarsen(case.ct, VOXEL_MM), found.prepared, found.pose, found.collapse
+    checks = Checks(
+        compare(ct, prepared.inflated, pose.lung_inf, pose.inf_from_ct),
+        compare(ct, prepared.deflated, collapse.observed.found.lung, found.def_from_ct),
+    )
+    here = found.nodule_inf[None], found.nodule_def[None]
+    (lengths,), (axes,) = ellipsoid95(covariance(pose, collapse, *here, checks.chain))
+    gates = {**found.gates, **check_gates(checks, settings.gates), "ellipsoid": ellipsoid_gate(lengths, settings.gates)}
+    return replace(found, ellipsoid_mm=lengths, ellipsoid_axes=axes, gates=gates, checks=checks)
 
 
 def conclude(
@@ -85,9 +106,7 @@ def conclude(
     nodule_def = moved(nodule_inf[None])[0]
     (lengths,), (axes,) = ellipsoid95(covariance(pose, collapse, nodule_inf[None], nodule_def[None]))
     gates = quality_gates(pose, collapse, settings.gates)
-    gates["ellipsoid"] = at_most(
-        lengths[0], settings.gates.max_ellipsoid_mm, "The nodule's position is too uncertain for a wedge resection."
-    )
+    gates["ellipsoid"] = ellipsoid_gate(lengths, settings.gates)
     shown = {
         "inflated": (prepared.inflated.field.usable, nodule_inf),
         "deflated": (prepared.deflated.field.usable, nodule_def),
@@ -95,6 +114,12 @@ def conclude(
     gates["nodule_in_view"] = in_view(shown, settings.gates.max_out_of_view_mm, stages)
     _note(pose, collapse, stages)
     return Localization(prepared, pose, collapse, nodule_inf, nodule_def, lengths, axes, gates)
+
+
+def ellipsoid_gate(semi_axes_mm: Array, limits: GateSettings) -> Gate:
+    """Gate on the longest of the ellipsoid's semi-axes (3,)."""
+    too_uncertain = "The nodule's position is too uncertain for a wedge resection."
+    return at_most(semi_axes_mm.max(), limits.max_ellipsoid_mm, too_uncertain)
 
 
 def in_view(shown: Mapping[str, tuple[Mask, Array]], limit_mm: float, stages: Stages) -> Gate:

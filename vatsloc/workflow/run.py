@@ -123,7 +123,8 @@ def _tetra(mesh: TetMesh, displacement: Array, pressure: Array, det_f: Array, co
 
 def _with_radius95(found: Localization, lung: TetraMesh) -> TetraMesh:
     """With how sure the run is of each node."""
-    return replace(lung, point_data={**lung.point_data, RADIUS95: radius95(found.pose, found.collapse)})
+    radius = radius95(found.pose, found.collapse, None if found.checks is None else found.checks.chain)
+    return replace(lung, point_data={**lung.point_data, RADIUS95: radius})
 
 
 def _lung_box(lung: Mask) -> Grid:
@@ -189,6 +190,7 @@ def _record(case: Case, found: Localization, settings: Settings, stages: Stages)
                 "inflated": found.prepared.inflated.removed.entry(),
                 "deflated": found.prepared.deflated.removed.entry(),
             },
+            "check": None if found.checks is None else found.checks.entry(found.nodule_inf, found.nodule_def),
             "residuals": _residuals(found),
         },
     )

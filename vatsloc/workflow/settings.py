@@ -108,6 +108,8 @@ class GateSettings(_Table):
     max_held_back_mm: float = 5.0
     max_ellipsoid_mm: float = 15.0
     max_out_of_view_mm: float = 10.0
+    max_left_over_mm: float = 4.0
+    min_recognized: float = 0.15
 
 
 class Settings(_Table):

@@ -1,0 +1,175 @@
+"""Blocks compared by their self-similarity: how a voxel's neighbours resemble each other, whatever grey values they
+have.
+
+Gain, offset and noise of the scanner, and the density of the tissue, drop out; what is left is the shape of vessels and
+airways. Ref: Heinrich 2013 (self-similarity context, quantized, compared by Hamming distance).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from numba import njit, prange
+
+from registration.matching import between_voxels
+from registration.volume import Array
+
+STEP = 2
+"""Voxels from a voxel to the six neighbours that are compared with each other."""
+RIM = STEP + 1
+"""Voxels about an image that its border's neighbours reach."""
+LEVELS = 6
+"""Each comparison is told in so many steps; with 12 comparisons of 5 bits a voxel's description fits 64 bits."""
+BLOCK_RADIUS = 4
+"""Voxels; every other one within 1.1 times this radius is compared."""
+EXCLUDED = 2
+"""Shifts this near to the best one, in voxels, are the same place."""
+NO_COST = np.float32(61.0)
+"""Beyond any mean Hamming distance."""
+
+_SIX = np.array([(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)])
+_PAIRS = np.array([(a, b) for a, b in combinations(range(6), 2) if not np.array_equal(_SIX[a], -_SIX[b])])
+_STEPS = np.arange(-BLOCK_RADIUS, BLOCK_RADIUS + 1, 2)
+_BLOCK = np.array([(a, b, c) for a in _STEPS for b in _STEPS for c in _STEPS if a * a + b * b + c * c <= 20])
+
+
+@dataclass(frozen=True)
+class Similar:
+    """Where the blocks about some voxels look most alike in another image.
+
+    shift: (n, 3) voxels, between voxels; cost: (n,) mean Hamming distance of the best block, 0 to 60; runner_up: (n,)
+    of the best one elsewhere; is_inner: (n,) whether the best one lies inside the search and the image.
+    """
+
+    shift: Array
+    cost: Array
+    runner_up: Array
+    is_inner: Array
+
+
+def describe(hu: Array, needed: Array) -> Array:
+    """Self-similarity (ni, nj, nk) uint64 of an image (ni, nj, nk) at the voxels `needed` (bool), 0 elsewhere.
+
+    Ref: Heinrich 2013, eq. 3 and 4.
+    """
+    out = np.zeros(hu.shape, np.uint64)
+    padded = np.pad(np.asarray(hu, np.float32), RIM, mode="edge")
+    _describe(padded, np.ascontiguousarray(needed), _SIX[_PAIRS[:, 0]] * STEP, _SIX[_PAIRS[:, 1]] * STEP, out)
+    return out
+
+
+def find_similar(fixed: Array, moving: Array, allowed: Array, starts: Array, reach: int) -> Similar:
+    """The blocks of `moving` most like those of `fixed` about voxels `starts` (n, 3), up to `reach` voxels away.
+
+    fixed, moving: descriptions of two images on one grid; allowed: voxels of the moving image that count.
+    """
+    n = len(starts)
+    best, shift = np.full((n, 2), NO_COST, np.float32), np.zeros((n, 3), np.int64)
+    around = np.full((n, 27), NO_COST, np.float32)
+    starts = np.ascontiguousarray(starts, np.int64)
+    _search(fixed, moving, np.ascontiguousarray(allowed), starts, _BLOCK, reach, best, shift, around)
+    offset, is_top = between_voxels(-around / NO_COST)
+    return Similar(shift + offset, best[:, 0], best[:, 1], is_top)
+
+
+@njit(cache=True)
+def _popcount(bits):
+    """How many of 64 bits are set."""
+    bits -= (bits >> np.uint64(1)) & np.uint64(0x5555555555555555)
+    bits = (bits & np.uint64(0x3333333333333333)) + ((bits >> np.uint64(2)) & np.uint64(0x3333333333333333))
+    bits = (bits + (bits >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
+    return np.int64((bits * np.uint64(0x0101010101010101)) >> np.uint64(56))
+
+
+@njit(cache=True)
+def _difference(hu, i, j, k, one, other):
+    """Sum of squared differences of the 27 voxels about two neighbours of voxel (i, j, k)."""
+    total = np.float32(0)
+    for a in range(-1, 2):
+        for b in range(-1, 2):
+            for c in range(-1, 2):
+                p = hu[i + a + one[0], j + b + one[1], k + c + one[2]]
+                total += (p - hu[i + a + other[0], j + b + other[1], k + c + other[2]]) ** 2
+    return total
+
+
+@njit(cache=True, parallel=True)
+def _describe(padded, needed, first, second, out):
+    for i in prange(out.shape[0]):
+        apart = np.empty(len(first), np.float32)
+        for j in range(out.shape[1]):
+            for k in range(out.shape[2]):
+                if not needed[i, j, k]:
+                    continue
+                for m in range(len(first)):
+                    apart[m] = _difference(padded, i + RIM, j + RIM, k + RIM, first[m], second[m])
+                apart -= apart.min()
+                spread = max(apart.mean(), np.float32(1e-3))
+                bits = np.uint64(0)
+                for m in range(len(first)):
+                    level = min(int(np.exp(-apart[m] / spread) * LEVELS), LEVELS - 1)
+                    bits |= ((np.uint64(1) << np.uint64(level)) - np.uint64(1)) << np.uint64((LEVELS - 1) * m)
+                out[i, j, k] = bits
+
+
+@njit(cache=True)
+def _cost(fixed, moving, block, start, at):
+    """Mean Hamming distance of two blocks over the voxels that lie in both images."""
+    total, n = 0, 0
+    for m in range(len(block)):
+        p, q, r = start[0] + block[m, 0], start[1] + block[m, 1], start[2] + block[m, 2]
+        x, y, z = at[0] + block[m, 0], at[1] + block[m, 1], at[2] + block[m, 2]
+        if min(p, q, r, x, y, z) < 0 or max(p, x) >= fixed.shape[0]:
+            continue
+        if max(q, y) >= fixed.shape[1] or max(r, z) >= fixed.shape[2]:
+            continue
+        total += _popcount(fixed[p, q, r] ^ moving[x, y, z])
+        n += 1
+    return np.float32(total / n) if 2 * n >= len(block) else NO_COST
+
+
+@njit(cache=True)
+def _fill(cost, fixed, moving, allowed, block, start, middle, half, step):
+    """Costs of every `step`-th shift up to `half` about the shift at `middle` (3,) of an array of costs."""
+    reach, at = cost.shape[0] // 2, np.empty(3, np.int64)
+    for a in range(max(middle[0] - half, 0), min(middle[0] + half + 1, cost.shape[0]), step):
+        for b in range(max(middle[1] - half, 0), min(middle[1] + half + 1, cost.shape[1]), step):
+            for c in range(max(middle[2] - half, 0), min(middle[2] + half + 1, cost.shape[2]), step):
+                at[0], at[1], at[2] = start[0] + a - reach, start[1] + b - reach, start[2] + c - reach
+                if at.min() < 0 or at[0] >= moving.shape[0] or at[1] >= moving.shape[1] or at[2] >= moving.shape[2]:
+                    continue
+                if allowed[at[0], at[1], at[2]]:
+                    cost[a, b, c] = _cost(fixed, moving, block, start, at)
+
+
+@njit(cache=True)
+def _top(cost):
+    top, width = np.argmin(cost), cost.shape[0]
+    return np.array([top // width**2, top // width % width, top % width])
+
+
+@njit(cache=True, parallel=True)
+def _search(fixed, moving, allowed, starts, block, reach, best, shift, around):
+    """Fill costs (n, 2) of the best and the next best shift (n, 3), and the costs (n, 27) about the best.
+
+    Every other shift is compared, and all about the best of these.
+    """
+    width = 2 * reach + 1
+    for n in prange(starts.shape[0]):
+        cost, middle = np.full((width, width, width), NO_COST), np.full(3, reach)
+        _fill(cost, fixed, moving, allowed, block, starts[n], middle, reach, 2)
+        _fill(cost, fixed, moving, allowed, block, starts[n], _top(cost), 3, 1)
+        top = _top(cost)
+        i, j, k = top
+        best[n, 0] = cost[i, j, k]
+        shift[n] = top - reach
+        if top.min() > 0 and top.max() < width - 1:
+            around[n] = cost[i - 1 : i + 2, j - 1 : j + 2, k - 1 : k + 2].copy().ravel()
+        cost[
+            max(i - EXCLUDED, 0) : i + EXCLUDED + 1,
+            max(j - EXCLUDED, 0) : j + EXCLUDED + 1,
+            max(k - EXCLUDED, 0) : k + EXCLUDED + 1,
+        ] = NO_COST
+        best[n, 1] = cost.min()
