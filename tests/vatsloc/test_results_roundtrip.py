@@ -16,11 +16,12 @@ from registration.rigid import RigidTransform
 from registration.volume import Array, Grid, Mask, Volume, axis_codes
 from tests.vatsloc.run_scene import lps_grid
 from vatsloc import results
+from vatsloc.evaluation import read_result, read_truth
 from vatsloc.formats.fields import read_field
 from vatsloc.formats.images import read_mask, read_volume
-from vatsloc.formats.markups import read_points
+from vatsloc.formats.markups import PointList, read_points, write_points
 from vatsloc.formats.meshes import Surface, TetraMesh, read_surface, read_vtu
-from vatsloc.formats.nifti import read_nifti
+from vatsloc.formats.nifti import read_nifti, write_volume
 from vatsloc.formats.transforms import read_tfm
 from vatsloc.frames import reorient
 from vatsloc.results import ResultData, RunRecord, read_run, write_results
@@ -192,6 +193,61 @@ def test_run_json_is_the_record(folder: Path, data: ResultData) -> None:
     for key in ("status", "theta", "seconds", "peak_mb", "skipped", "gates"):
         assert run[key] == getattr(data.run, key), key
     assert (run["warnings"], run["seed"]) == (["first", "second"], 7)
+
+
+def test_the_evaluation_reads_each_part_from_the_file_that_names_it(folder: Path, data: ResultData) -> None:
+    found = read_result(folder)
+    def_from_ct = DEFLATED_FROM_INFLATED.matrix @ INFLATED_FROM_CT.matrix
+    for rigid, matrix in (
+        (found.maps.rigid_inf_from_ct, INFLATED_FROM_CT.matrix),
+        (found.maps.rigid_def_from_inf, DEFLATED_FROM_INFLATED.matrix),
+        (found.maps.rigid_def_from_ct, def_from_ct),
+    ):
+        assert_allclose(rigid(np.eye(3)), np.eye(3) @ matrix[:3, :3].T + matrix[:3, 3])
+    for field, source in (
+        (found.maps.inf_from_ct, data.inflated_from_ct),
+        (found.maps.def_from_ct, data.deflated_from_ct),
+        (found.field, data.deflated_from_ct),
+    ):
+        points = source.grid.points()[1:-1, 1:-1, 1:-1].reshape(-1, 3)
+        assert_allclose(field(points), source(points), atol=1e-3)
+    lungs = {state: getattr(data, f"lung_{state}").points_ras for state in ("ct", "inflated", "deflated")}
+    assert_allclose(found.lung_ct.points, lungs["ct"])
+    assert_allclose(found.lung_inflated.points, lungs["inflated"])
+    phase2: Any = found.maps.def_from_inf
+    assert_allclose(phase2.mesh.points, lungs["inflated"])
+    assert_allclose(phase2.moved, lungs["deflated"])
+    assert_allclose(phase2.around.matrix, DEFLATED_FROM_INFLATED.matrix, atol=1e-12)
+    assert_allclose(found.radius95_mm, data.lung_deflated.point_data["radius95_mm"])
+    assert_allclose(found.nodule_inflated_ras, [7, -8, 9])
+    assert_allclose(found.nodule_deflated_ras, [3, 1, 2])
+    assert found.run == read_run(folder)
+
+
+def test_the_evaluation_reads_each_truth_from_the_file_that_names_it(tmp_path: Path) -> None:
+    (tmp_path / "truth").mkdir()
+    images = [f'{name} = "{name}.nii.gz"' for name in AXES]
+    lines = ['side = "right"', "[images]", *images, "[nodule]", 'point = "n.mrk.json"']
+    (tmp_path / "case.toml").write_text("\n".join(lines))
+    noise = np.random.default_rng(4)
+    points = {name: noise.normal(0, 20, (3, 3)) for name in AXES}
+    nodules = {"cbct_inflated": [[1.0, 2, 3]], "cbct_deflated": [[4.0, 5, 6]]}
+    for name, grid in zip(AXES, (CT, INFLATED, DEFLATED), strict=True):
+        image = noise.normal(-400, 300, (*grid.shape[:2], 40)).astype(np.float32)
+        write_volume(tmp_path / f"{name}.nii.gz", Volume(image, grid.ras_from_ijk))
+        write_points(tmp_path / f"landmarks_{name}.mrk.json", PointList(points[name], ("a", "b", "c")))
+    for name, nodule in nodules.items():
+        write_points(tmp_path / "truth" / f"nodule_{name}.mrk.json", PointList(np.array(nodule), ("n",)))
+    np.savetxt(tmp_path / "truth" / "dense_ras_mm.csv", np.arange(18.0).reshape(2, 9), delimiter=",", header="x")
+    truth = read_truth(tmp_path)
+    assert_allclose(truth.landmarks.ct, points["ct"])
+    assert_allclose(truth.landmarks.inflated, points["cbct_inflated"])
+    assert_allclose(truth.landmarks.deflated, points["cbct_deflated"])
+    assert_allclose(truth.nodule.nodule_inflated_ras, [1, 2, 3])
+    assert_allclose(truth.nodule.nodule_deflated_ras, [4, 5, 6])
+    for view, grid in (("inflated", INFLATED), ("deflated", DEFLATED)):
+        assert truth.fields_of_view[view].grid.same_as(Grid((*grid.shape[:2], 40), grid.ras_from_ijk))
+    assert_allclose(truth.dense, np.arange(18.0).reshape(2, 3, 3))
 
 
 def test_every_output_has_a_name_of_its_own() -> None:
