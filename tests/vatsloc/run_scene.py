@@ -140,9 +140,12 @@ def ball(grid: Grid, centre: Array, radius_mm: float) -> Mask:
 
 def ball_mesh(centre: Array, radius_mm: float, edge_mm: float) -> TetMesh:
     """Tetrahedra that fill a ball."""
+
+    def depth_mm(points: Array) -> Array:
+        return radius_mm - np.linalg.norm(points - centre, axis=-1)
+
     margin = radius_mm + 5
-    level = lambda x: radius_mm - np.linalg.norm(x - centre, axis=-1)  # noqa: E731
-    return stuff_level_set(level, centre - margin, centre + margin, edge_mm)
+    return stuff_level_set(depth_mm, centre - margin, centre + margin, edge_mm)
 
 
 CT_GRID = lps_grid((38, 36, 40), (3.0, 3.2, 2.9), np.add(CENTRE, [2.0, 1.0, -1.0]))
@@ -267,10 +270,9 @@ def _collapse(lung: TetMesh) -> Collapse:
         hilum_nodes=np.array([2, 3]),
         motion=HilumMotion(np.array([[1.0, 2, 3], [3.0, 6, 5]]), HilumSource.AIRWAYS),
     )
-    model = Model(
-        system, _fit(model_mesh), np.zeros_like(model_mesh.points), Pairs(nothing, nothing, np.zeros(0)), (), solid,
-        np.zeros((0, *model_mesh.points.shape)),
-    )  # fmt: skip
+    found_again, others = Pairs(nothing, nothing, np.zeros(0)), np.zeros((0, *model_mesh.points.shape))
+    still = np.zeros_like(model_mesh.points)
+    model = Model(system, _fit(model_mesh), still, found_again, (), solid, others)
     return Collapse(observed, model, None, after.points)
 
 

@@ -52,14 +52,12 @@ def data() -> ResultData:
     def lung() -> TetraMesh:
         nodal = {name: rng.normal(size=5) for name in ("pressure_kpa", "contact_pressure_kpa", "radius95_mm")}
         nodal["displacement"] = rng.normal(size=(5, 3))
-        return TetraMesh(rng.normal(0, 30, (5, 3)), np.array([[0, 1, 2, 3], [1, 2, 3, 4]]), nodal, {
-            "det_f": rng.normal(size=2)
-        })  # fmt: skip
+        tets = np.array([[0, 1, 2, 3], [1, 2, 3, 4]])
+        return TetraMesh(rng.normal(0, 30, (5, 3)), tets, nodal, {"det_f": rng.normal(size=2)})
 
     def skin() -> Surface:
-        return Surface(rng.normal(0, 30, (4, 3)).astype(np.float32).astype(float), rng.permutation(
-            [[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]]
-        ))  # fmt: skip
+        faces = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
+        return Surface(rng.normal(0, 30, (4, 3)), rng.permutation(faces))
 
     nodule = np.array([3.0, 1.0, 2.0])
     return ResultData(
