@@ -44,6 +44,16 @@ def test_the_nodule_goes_through_both_phases() -> None:
     assert found.collapse is known.scene().collapse
 
 
+def test_maps_to_the_deflated_image_agree_with_the_lung_and_beyond_it_with_the_spine() -> None:
+    found = concluded(known.scene())
+    for mapping, start, rigid in (
+        (found.def_from_ct, known.NODULE_CT, known.DEF_FROM_CT_RIGID),
+        (found.def_from_inf, known.NODULE_INF, known.DEF_FROM_INF_RIGID),
+    ):
+        assert_allclose(mapping(start[None])[0], known.NODULE_DEF)
+        assert_allclose(mapping.around.matrix, rigid.matrix, atol=1e-12)
+
+
 def test_the_ellipsoid_is_that_of_the_nodule_where_the_spine_places_it() -> None:
     lengths, directions = spread()
     found = concluded(known.scene())
