@@ -13,24 +13,14 @@ from scipy.spatial.transform import Rotation
 
 from registration.field import DisplacementField
 from registration.volume import Mask, Volume, axis_codes
-from vatsloc.formats.fields import read_field
 from vatsloc.formats.folder import is_result, whole_folder
-from vatsloc.formats.markups import read_points
-from vatsloc.formats.meshes import Surface, TetraMesh, read_surface, read_vtu
-from vatsloc.formats.transforms import read_tfm
+from vatsloc.formats.meshes import Surface, TetraMesh
 from vatsloc.results import (
-    CT_FROM_DEFLATED,
     CT_IN_DEFLATED,
-    DEFLATED_STL,
     INFLATED_FROM_CT,
-    LUNG_DEFLATED,
-    NODULE_DEFLATED,
-    NODULE_INFLATED,
     NODULE_MASK,
     OUTPUT_FILES,
     REPORT,
-    RIGID_CT_FROM_INFLATED,
-    RIGID_INFLATED_FROM_CT,
     SCENE,
     ResultData,
     RunRecord,
@@ -105,21 +95,6 @@ def test_output_set_is_complete_and_a_result(tmp_path):
             (folder / name).write_text("<html></html>")
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == sorted(OUTPUT_FILES)
     assert is_result(tmp_path / "out")
-
-
-def test_every_file_reads_back_to_what_was_in_memory(tmp_path):
-    data = result()
-    write_results(tmp_path, data)
-    assert_allclose(read_points(tmp_path / NODULE_DEFLATED).ras, [NODULE])
-    assert_allclose(read_points(tmp_path / NODULE_INFLATED).ras, [NODULE - 5])
-    assert_allclose(read_vtu(tmp_path / LUNG_DEFLATED).points_ras, POINTS)
-    assert_allclose(np.sort(read_surface(tmp_path / DEFLATED_STL).points_ras, axis=0), np.sort(POINTS, axis=0))
-    assert_allclose(read_tfm(tmp_path / RIGID_INFLATED_FROM_CT), data.rigid_inflated_from_ct, atol=1e-12)
-    back = read_tfm(tmp_path / RIGID_CT_FROM_INFLATED)
-    assert_allclose(back @ data.rigid_inflated_from_ct, np.eye(4), atol=1e-12)
-    points = data.inflated_from_ct.grid.points()[1:-1, 1:-1, 1:-1].reshape(-1, 3)
-    for name, field in ((INFLATED_FROM_CT, data.inflated_from_ct), (CT_FROM_DEFLATED, data.ct_from_deflated)):
-        assert_allclose(read_field(tmp_path / name)(points), field(points), atol=2e-3)
 
 
 def test_images_get_the_voxel_order_of_the_input_files(tmp_path):
