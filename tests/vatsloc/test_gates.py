@@ -119,6 +119,8 @@ def test_limits_are_those_of_the_documentation() -> None:
         "max_held_back_mm": 5.0,
         "max_ellipsoid_mm": 15.0,
         "max_out_of_view_mm": 10.0,
+        "max_left_over_mm": 4.0,
+        "min_recognized": 0.15,
     }
 
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from registration.rigid import RigidTransform
 from registration.volume import Array
@@ -34,17 +35,20 @@ def stability_faults(cases: Sequence[Path], out: Path, settings: Settings, say: 
     Another patient's scan is the next case's, for the last one the first's. Raises CaseError as reading does.
     """
     rows: list[Row] = []
+    beside: list[Row] = []
     for number, folder in enumerate(cases):
         scene, name = read_scene(folder, settings), folder.resolve().name
         other = read_scene(cases[(number + 1) % len(cases)], settings).case if len(cases) > 1 else None
-        for fault, row in _rows(scene, other):
+        found = _finished(scene)
+        beside += [{"case": name} | row for row in beside_truth(found, scene.truth.dense)]
+        for fault, row in _rows(scene, other, found):
             rows.append({"case": name, "fault": fault} | row)
             say(f"{name}: {fault}: {row['landmarks, mm']} mm, {row['noticed by'] or 'not noticed'}")
         out.mkdir(parents=True, exist_ok=True)
-        (out / "tables.md").write_text(page(rows), encoding="utf-8")
+        (out / "tables.md").write_text(page(rows, beside), encoding="utf-8")
 
 
-def page(rows: list[Row]) -> str:
+def page(rows: list[Row], beside: list[Row]) -> str:
     """The table as a markdown page, with the shares of faults noticed, of silent ones and of false alarms."""
     wrong = [row for row in rows if row["wrong"]]
     noticed = sum(bool(row["noticed by"]) for row in wrong)
@@ -57,7 +61,47 @@ def page(rows: list[Row]) -> str:
         f"{len(rows)} runs {len(wrong)} were wrong: **{noticed} noticed** ({by_check} by the stage `check`), "
         f"**{len(wrong) - noticed} silent**. Of the {len(right)} right ones {alarms} were marked."
     )
-    return f"# Does a run notice that it is wrong?\n\n{text}\n\n{markdown(rows)}\n"
+    parts = ["# Does a run notice that it is wrong?", text, markdown(rows)]
+    if beside:
+        told = (
+            "What the check finds left over in undisturbed runs, beside the true error at the same places (mean of the "
+            "four nearest points of dense truth, weighted by distance), median / 90 % in mm:"
+        )
+        parts += ["## What is left over, beside the truth", told, markdown(beside)]
+    return "\n\n".join(parts) + "\n"
+
+
+def beside_truth(found: Localization, dense: Array | None) -> list[Row]:
+    """What the check of a run found left over, a row each for phase 1 and the chain, beside the true error there.
+
+    dense: (n, 3, 3) tissue points in CT, inflated and deflated CBCT, or None: no rows.
+    """
+    if dense is None or found.checks is None:
+        return []
+    rows: list[Row] = []
+    for part, left, carry, image in (
+        ("phase 1", found.checks.phase1, found.pose.inf_from_ct, 1),
+        ("chain", found.checks.chain, found.def_from_ct, 2),
+    ):
+        error = carry(dense[:, 0]) - dense[:, image]
+        distance, number = cKDTree(dense[:, image]).query(left.points, 4)
+        weight = 1 / (distance + 1) ** 2
+        true = (error[number] * weight[..., None]).sum(axis=1) / weight.sum(axis=1, keepdims=True)
+        rows.append(
+            {
+                "part": part,
+                "looked for": left.looked_for,
+                "recognized": len(left.points),
+                "left over": _median_and_90(left.vectors),
+                "true error": _median_and_90(true),
+                "difference of both vectors": _median_and_90(left.vectors - true),
+            }
+        )
+    return rows
+
+
+def _median_and_90(vectors: Array) -> str:
+    return " / ".join(f"{mm:.2f}" for mm in np.percentile(np.linalg.norm(vectors, axis=1), (50, 90)))
 
 
 def score(answer: Localization, truth: Truth) -> Row:
@@ -72,8 +116,8 @@ def score(answer: Localization, truth: Truth) -> Row:
     }
 
 
-def _rows(scene: Scene, other: Case | None) -> list[tuple[str, Row]]:
-    found = _finished(scene)
+def _rows(scene: Scene, other: Case | None, found: Localization) -> list[tuple[str, Row]]:
+    """Every fault and how the run fared; found: the run without any."""
     rows = [("nothing", score(found, scene.truth))]
     for name, fault in FAULTS.items():
         moved = fault(found.collapse.points_after, np.random.default_rng(0))
