@@ -42,14 +42,14 @@ def test_a_lobe_is_a_part_and_shuffled_nodes_are_the_same_ones() -> None:
 
 def answer(**parts: object) -> Any:
     """Stands in for a localization that carries a point by +5 mm along R in each phase."""
-    maps = SimpleNamespace(inf_from_ct=lambda x: x + [5.0, 0, 0])
-    return cast(Any, SimpleNamespace(pose=maps, def_from_ct=lambda x: x + [10.0, 0, 0], **parts))
+    maps = SimpleNamespace(inf_from_ct=lambda x: x + np.array([5.0, 0, 0]))
+    return cast(Any, SimpleNamespace(pose=maps, def_from_ct=lambda x: x + np.array([10.0, 0, 0]), **parts))
 
 
 def test_a_run_is_scored_against_its_truth() -> None:
     ct = np.zeros((2, 3))
     truth: Any = SimpleNamespace(
-        landmarks=SimpleNamespace(ct=ct, deflated=ct + [10.0, 2.0, 0.0]),
+        landmarks=SimpleNamespace(ct=ct, deflated=ct + np.array([10.0, 2.0, 0.0])),
         nodule=SimpleNamespace(nodule_deflated_ras=np.array([0.0, 4.0, 0.0])),
     )
     gates = {"check": at_most(5.0, 4.0, "x"), "surface": at_most(1.0, 2.0, "y")}
@@ -61,7 +61,7 @@ def test_a_run_is_scored_against_its_truth() -> None:
 
 def test_what_is_left_stands_beside_the_true_error_of_its_own_part() -> None:
     ct = np.random.default_rng(5).uniform(0, 50, (500, 3))
-    dense = np.stack([ct, ct + [5.0, -1.0, 0], ct + [10.0, 0, -3.0]], axis=1)
+    dense = np.stack([ct, ct + np.array([5.0, -1.0, 0]), ct + np.array([10.0, 0, -3.0])], axis=1)
     told = (LeftOver(dense[:40, 1], np.tile([0.0, 1.0, 0], (40, 1)), 80), LeftOver(dense[:9, 2], np.zeros((9, 3)), 10))
     one, chain = beside_truth(answer(checks=Checks(*told)), dense)
     assert (one["part"], one["looked for"], one["recognized"]) == ("phase 1", 80, 40)
