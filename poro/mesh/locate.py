@@ -36,7 +36,7 @@ def locate(mesh: TetMesh, points: Array, nearest: bool = True) -> Location:
     x = mesh.points[mesh.tets]
     lower, upper = x.min(axis=1), x.max(axis=1)
     origin = mesh.points.min(axis=0)
-    width = float(np.cbrt(mesh.volumes.mean() * 6))
+    width = float(np.cbrt(np.abs(mesh.volumes).mean() * 6))
     shape = np.floor((mesh.points.max(axis=0) - origin) / width).astype(np.int64) + 1
     first = np.clip(((lower - origin) / width).astype(np.int64), 0, shape - 1)
     last = np.clip(((upper - origin) / width).astype(np.int64), 0, shape - 1)

@@ -124,3 +124,10 @@ def test_box_fixture_fills_its_volume() -> None:
     mesh = box((3, 2, 4), (3.0, 4.0, 5.0))
     assert mesh.volumes.sum() == pytest.approx(60)
     assert (mesh.volumes > 0).all()
+
+
+def test_points_are_located_in_a_mesh_turned_inside_out() -> None:
+    mesh = stuff_level_set(lambda x: 20.0 - np.linalg.norm(x, axis=-1), np.full(3, -22.0), np.full(3, 22.0), 8.0)
+    mirrored = TetMesh(mesh.points * [-1, 1, 1], mesh.tets)
+    found = locate(mirrored, np.array([[3.0, 2.0, 1.0]]))
+    assert_allclose(interpolate(found, mirrored.points)[0], [3, 2, 1], atol=1e-9)

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from registration.rigid import RigidTransform
 from registration.volume import Array
-from vatsloc.case import Case
+from vatsloc.case import Case, read_case
 from vatsloc.errors import VatslocError
 from vatsloc.evaluation.inputs import Truth
 from vatsloc.study.stability_fit import Scene, direction, errors_mm, read_scene, slipped_spine
@@ -38,7 +38,7 @@ def stability_faults(cases: Sequence[Path], out: Path, settings: Settings, say: 
     beside: list[Row] = []
     for number, folder in enumerate(cases):
         scene, name = read_scene(folder, settings), folder.resolve().name
-        other = read_scene(cases[(number + 1) % len(cases)], settings).case if len(cases) > 1 else None
+        other = read_case(cases[(number + 1) % len(cases)]) if len(cases) > 1 else None
         found = _finished(scene)
         beside += [{"case": name} | row for row in beside_truth(found, scene.truth.dense)]
         for fault, row in _rows(scene, other, found):
