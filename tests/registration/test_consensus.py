@@ -53,7 +53,7 @@ def test_a_vote_is_a_guess_within_five_millimetres_turned_as_its_place_is() -> N
     at = np.tile(MIDDLE, (2, 1))
     off = Pairs(turned(at) + np.array([[0, 4.9, 0], [0, 5.1, 0]]), at, np.ones(2))
     assert seconded(off, pairs, maps, SETTINGS).tolist() == [True, False]
-    aside = np.tile(MIDDLE + [6.0, 0, 0], (1, 1))
+    aside = np.tile(MIDDLE + np.array([6.0, 0, 0]), (1, 1))
     assert seconded(Pairs(turned(aside), aside, np.ones(1)), pairs, maps, SETTINGS).tolist() == [True]
     straight = np.tile(np.eye(3), (8, 1, 1))  # maps that do not know the turn miss by up to 2 x 10 mm
     assert (np.linalg.norm(turned(at[:1]) - (turned(x) + MIDDLE - x), axis=1) > 5).sum() > 6
@@ -81,7 +81,7 @@ def test_a_guess_lies_where_its_guide_and_the_gradient_about_it_say_and_is_made_
     x = ring(6, 12.0, seed=4)
     pairs = Pairs(turned(x), x, np.ones(6))
     maps, none = np.tile(TURN, (6, 1, 1)), np.zeros(0, np.int64)
-    places = np.stack([MIDDLE + [1.0, 2.0, -1.0], MIDDLE + [5.0, 0, 0], MIDDLE + [60.0, 0, 0], MIDDLE + [0, 5.0, 0]])
+    places = MIDDLE + np.array([[1.0, 2, -1], [5, 0, 0], [60, 0, 0], [0, 5, 0]])
     is_open = np.array([True, True, True, False])
     guesses, tried = _guesses(places, is_open, pairs, maps, none, SETTINGS)
     # All guides agree, so one speaks for each open place within reach: its nearest.

@@ -63,7 +63,6 @@ def ball_of(grid: Grid, centre: Array, radius: float = RADIUS_MM) -> Array:
     return np.linalg.norm(grid.points() - centre, axis=-1) < radius
 
 
-
 def _image(grid: Grid, lung: Array, place_ct: Array, beyond: Array | float) -> Volume:
     """HU of voxels: of lung tissue by its place (n, 3) in the CT, `beyond` elsewhere."""
     hu = np.broadcast_to(beyond, grid.shape).astype(np.float32)

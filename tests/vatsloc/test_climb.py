@@ -104,7 +104,9 @@ def test_held_back_places_are_never_shown_to_the_model_that_is_judged_by_them() 
 
     def watched(model: Model, target: Target, start: Fit) -> Model:
         shown.append((model, target, start))
-        return replace(model, displacement=(0.7 + 0.1 * len(shown)) * motion(model.system.mesh.points), fit=a_fit(0 * u))
+        return replace(
+            model, displacement=(0.7 + 0.1 * len(shown)) * motion(model.system.mesh.points), fit=a_fit(0 * u)
+        )
 
     start = a_model(0.2)
     u, surface = start.displacement, a_surface()
@@ -211,7 +213,8 @@ def test_settings_of_a_run_reach_the_fit() -> None:
 
 
 @pytest.mark.parametrize(
-    ("share", "before", "taken"), [(0.0005, 0.0, True), (0.002, 0.0, False), (0.002, 0.002, True), (0.004, 0.002, False)]
+    ("share", "before", "taken"),
+    [(0.0005, 0.0, True), (0.002, 0.0, False), (0.002, 0.002, True), (0.004, 0.002, False)],
 )
 def test_a_correction_that_turns_more_elements_inside_out_is_refused(
     monkeypatch: pytest.MonkeyPatch, share: float, before: float, taken: bool
@@ -304,7 +307,9 @@ class Climb:
             monkeypatch.setattr(module, name, self._asked(name, answer))
         whole = len(pairs)
         monkeypatch.setattr(
-            module, "corrected", lambda _strain: lambda m, t, s: knows(1.0 if len(t.inflated) == whole else 0.7)(m, t, s)
+            module,
+            "corrected",
+            lambda _strain: lambda m, t, s: knows(1.0 if len(t.inflated) == whole else 0.7)(m, t, s),
         )
 
     def _asked(self, name: str, answer: Any) -> Any:

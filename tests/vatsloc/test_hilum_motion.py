@@ -17,7 +17,7 @@ from vatsloc.workflow import hilum
 from vatsloc.workflow.hilum import HilumMotion, HilumSource, _Shifted, hilum_motion
 
 INF_FROM_DEF = scene.DEF_FROM_INF.inverse()
-AT = scene.CENTRE_DEF + [-30.0, 5.0, -10.0]
+AT = scene.CENTRE_DEF + np.array([-30.0, 5.0, -10.0])
 POINTS = AT + np.random.default_rng(2).uniform(-8, 8, (15, 3))
 AS_A_WHOLE = np.array([6.0, -4.0, 2.0])
 

@@ -20,7 +20,7 @@ from vatsloc.workflow.pose import ChangeOfPose
 from vatsloc.workflow.settings import Settings, settings_of
 from vatsloc.workflow.stages import Stages
 
-HILUM_CT = scene.CENTRE_CT + [-25.0, 6.0, -4.0]
+HILUM_CT = scene.CENTRE_CT + np.array([-25.0, 6.0, -4.0])
 INF_FROM_DEF = scene.DEF_FROM_INF.inverse()
 COARSE = {"mesh": {"model_edge_mm": 14.0}}
 

@@ -60,7 +60,7 @@ def test_spreading_gets_both_images_in_one_frame_and_the_lung_of_each(
     observed: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     warped = scene.CENTRE_DEF + np.random.default_rng(1).uniform(-18, 18, (30, 3))
-    second = warped + [1.0, 2.0, 3.0]
+    second = warped + np.array([1.0, 2.0, 3.0])
     model = 0.6 * (scene.collapsed(observed.model_mesh.points) - observed.model_mesh.points)
     matched: dict[str, Any] = {}
     grown: dict[str, Any] = {}
@@ -87,8 +87,10 @@ def test_spreading_gets_both_images_in_one_frame_and_the_lung_of_each(
     assert grown["settings"].match == matched["settings"]
     # Tissue in the region of the modelled and of the observed lung.
     for region, expanded in (
-        (matched["first_region"], lambda x: scene.CENTRE_DEF + (x - scene.CENTRE_DEF - 0.6 * scene.SHIFT_MM)
-         @ np.linalg.inv(gradient).T),
+        (
+            matched["first_region"],
+            lambda x: scene.CENTRE_DEF + (x - scene.CENTRE_DEF - 0.6 * scene.SHIFT_MM) @ np.linalg.inv(gradient).T,
+        ),
         (matched["region"], scene.expanded),
     ):
         points = region.grid.points()[region.inside]
@@ -116,9 +118,7 @@ def test_under_the_right_map_both_images_show_the_same(observed: Any) -> None:
     assert_array_equal(view.lung.inside & ~view.both_see.inside, False)
     assert_array_equal(view.modelled.inside & ~view.both_see.inside, False)
     inner = np.random.default_rng(5).uniform(-15, 15, (20, 3)) + scene.CENTRE_DEF
-    assert_allclose(
-        view.inf_from_def(inner), scene.DEF_FROM_INF.inverse()(scene.expanded(inner)), atol=0.05
-    )
+    assert_allclose(view.inf_from_def(inner), scene.DEF_FROM_INF.inverse()(scene.expanded(inner)), atol=0.05)
 
 
 def test_the_modelled_lung_is_the_moved_mesh(observed: Any) -> None:

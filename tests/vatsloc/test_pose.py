@@ -278,8 +278,9 @@ def test_deep_inside_keeps_off_the_rim_and_the_end_of_the_image() -> None:
     middle = np.array([10.0, 20.0, -30.0])
     deep = np.array([[0.0, 0, 0], [2, 0, 0], [-32, 0, 0], [0, 32, 0], [0, 0, -32]])
     assert _deep_inside(region, middle + deep).all()
+    shallow = np.array([[10.5, 0, 0], [15, 0, 0], [-39.9, 0, 0], [0, 39.9, 0], [0, 0, 60]])
     # Not on the rim itself and not beyond: voxels of 4 mm tell its place within 2 mm.
-    assert not _deep_inside(region, middle + [[10.5, 0, 0], [15, 0, 0], [-39.9, 0, 0], [0, 39.9, 0], [0, 0, 60]]).any()
+    assert not _deep_inside(region, middle + shallow).any()
 
 
 def test_settings_of_a_run_reach_the_registration() -> None:

@@ -63,9 +63,7 @@ def run(
 ) -> Residual | None:
     monkeypatch.setattr(residual, "register_ffd", registration)
     lung = scene.lung_deflated() if lung is None else lung
-    return residual_registration(
-        scene.prepared(**usable), lung, Scene.model, Scene.before, surface, settings, pairs
-    )
+    return residual_registration(scene.prepared(**usable), lung, Scene.model, Scene.before, surface, settings, pairs)
 
 
 def shifted(offset: Array) -> Callable[[Array], Array]:
@@ -107,7 +105,9 @@ def test_believed_nodes_go_half_way_between_both_answers_and_the_others_follow(
     assert_allclose(found.disagreement_mm, np.where(inner, 1.0, 4.0), atol=0.02)
     assert found.compared.mean() > 0.9
     assert_array_equal(found.seen, inner & found.compared)
-    assert_allclose(found.displacement, np.broadcast_to(OFF + [0.5, 0, 0], found.displacement.shape), atol=0.02)
+    assert_allclose(
+        found.displacement, np.broadcast_to(OFF + np.array([0.5, 0, 0]), found.displacement.shape), atol=0.02
+    )
     assert found.min_det == 0.2
 
 

@@ -116,7 +116,7 @@ def test_a_correction_is_the_same_field() -> None:
 
 
 def hilum_of(mesh: TetMesh) -> Array:
-    return held_nodes(mesh, scene.CENTRE_CT + [-30.0, 0, 0], 16.0)
+    return held_nodes(mesh, scene.CENTRE_CT + np.array([-30.0, 0, 0]), 16.0)
 
 
 def test_a_solved_and_a_fitted_lung_are_the_same() -> None:

@@ -24,8 +24,9 @@ def halves(x: Array) -> tuple[Array, Array, Array]:
 
 @pytest.fixture(scope="module")
 def scene() -> tuple[Pneumothorax, SurfacePoints]:
-    """A ball of lung. Above: air, and on the right a second piece of lung beyond it. Below: soft tissue, against lung of
-    -700 HU (right, front), against such lung with a film of air under its skin (right, back), against dense lung (left).
+    """A ball of lung. Above: air, and on the right a second piece of lung beyond it. Below: soft tissue, against lung
+    of -700 HU (right, front), against such lung with a film of air under its skin (right, back), against dense lung
+    (left).
     """
     grid = grid_about(CENTRE, 64, 1.5)
     x = grid.points()
@@ -45,7 +46,9 @@ def scene() -> tuple[Pneumothorax, SurfacePoints]:
     found = Pneumothorax(gas, lung, whole, image, LIMIT_HU, CONTRAST_HU, 50.0, 90.0, tracked)
     surface = deflated_surface(found, cbct(image).field)
     on_ball = np.abs(np.linalg.norm(surface.points - CENTRE, axis=1) - RADIUS_MM) < 2.5
-    return found, SurfacePoints(*(v[on_ball] for v in (surface.points, surface.normals, surface.confidence, surface.border)))
+    return found, SurfacePoints(
+        *(v[on_ball] for v in (surface.points, surface.normals, surface.confidence, surface.border))
+    )
 
 
 def where(points: Array) -> dict[str, Array]:
