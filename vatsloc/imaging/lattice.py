@@ -7,7 +7,6 @@ from scipy import ndimage
 
 from registration.volume import Array, Grid, Mask, Volume
 
-
 TIE_MM = 1e-6
 """Spacings of a turned grid are rounded; a distance equal to the radius has to stay equal."""
 
