@@ -33,6 +33,8 @@ DEF_FROM_INF = RigidTransform.about(CENTRE_INF, np.array([-0.3, 0.2, 0.25]), np.
 CENTRE_DEF = DEF_FROM_INF(CENTRE_INF[None])[0]
 SHIFT_MM = np.array([4.0, -3.0, 5.0])
 SQUEEZE = np.array([[0.86, 0.05, 0.0], [-0.03, 0.9, 0.04], [0.02, 0.0, 0.84]])
+OTHER_OFFSET, OTHER_RADIUS_MM = np.array([-45.0, 10.0, 5.0]), 10.0
+AIRWAY_OFFSET = np.array([-30.0, 5.0, -10.0])
 _pattern = make_pattern(seed=9, waves=150, shortest_mm=11.0)
 
 
@@ -148,10 +150,6 @@ def prepared(usable_inflated: Array | None = None, usable_deflated: Array | None
         spines.append(Spine(bone, np.zeros((1, 3)), 300.0))
     lungs = Lungs(other, lung, airways, 0.0, {})
     return Prepared(lungs, lung, cbct(inflated(), usable_inflated), cbct(deflated(), usable_deflated), *spines)
-
-
-OTHER_OFFSET, OTHER_RADIUS_MM = np.array([-45.0, 10.0, 5.0]), 10.0
-AIRWAY_OFFSET = np.array([-30.0, 5.0, -10.0])
 
 
 def rigid_fit(moving_from_fixed: RigidTransform) -> RigidFit:

@@ -16,6 +16,7 @@ from poro.fit import Fit, FitSettings, FitStatus
 from poro.mesh import TetMesh
 from poro.model import PoroStatus, Theta
 from poro.observations import Target
+from poro.tissue import Tissue
 from registration.matching import Pairs
 from registration.volume import Array
 from tests.vatsloc import ball_scene as scene
@@ -247,8 +248,6 @@ def test_a_correction_that_turns_more_elements_inside_out_is_refused(
 def test_the_regional_fit_sets_stretches_and_hilum_free_and_starts_where_it_is_told(
     monkeypatch: pytest.MonkeyPatch, hilum: bool, count: int
 ) -> None:
-    from poro.tissue import Tissue
-
     @dataclass(frozen=True)
     class System:
         mesh: TetMesh
@@ -296,11 +295,11 @@ class Climb:
         )
         self.others = np.full((4, *lung.points.shape), 2.0)
         system = SimpleNamespace(mesh=lung, gravity=GRAVITY, hilum=HILUM)
-        share = {"linear": Chosen(self.solid, Strain.FINITE, "because", 0.01, None)}
+        chosen = Chosen(self.solid, Strain.FINITE, "because", 0.01, None)
         for name, answer in (
             ("assemble", system),
             ("fit", self.plain),
-            ("keep_in_range", share["linear"]),
+            ("keep_in_range", chosen),
             ("inner_pairs", pairs),
             ("other_answers", self.others),
         ):

@@ -33,9 +33,10 @@ def stretched(points_inf: Array) -> Array:
 class Watched:
     """`observe` with everything that reads images replaced by answers that are known; `asked` holds the questions."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, side: str = "right") -> None:
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, side: str = "right", hilum_ct: Array | None = None) -> None:
         self.prepared, self.asked = scene.prepared(), dict[str, tuple[Any, ...]]()
         self.side, self.hint, self.stages = side, None, Stages()
+        self.hilum_ct = HILUM_CT if hilum_ct is None else hilum_ct
         mesh = scene.lung_mesh()
         inflated = stretched(scene.INF_FROM_CT(mesh.points))
         rigid, lung = scene.rigid_fit(scene.INF_FROM_CT.inverse()), scene.empty(scene.inflated())
@@ -46,7 +47,7 @@ class Watched:
             "register_spine": scene.rigid_fit(INF_FROM_DEF),
             "find_pneumothorax": self.found,
             "deflated_surface": self.surface,
-            "find_hilum": Hilum(HILUM_CT, 20.0, True),
+            "find_hilum": Hilum(self.hilum_ct, 20.0, True),
             "hilum_motion": HilumMotion(np.zeros((1, 3)), HilumSource.AIRWAYS),
         }
         for name, answer in answers.items():
@@ -153,6 +154,17 @@ def test_the_hilum_is_found_in_the_ct_and_carried_by_the_mesh(watched: Watched) 
     far = np.linalg.norm(observed.model_mesh.points - at, axis=1)
     assert_array_equal(observed.hilum_nodes, held_nodes(observed.model_mesh, at, 15.0))
     assert far[observed.hilum_nodes].max() < np.delete(far, observed.hilum_nodes).min()
+
+
+def test_a_hilum_beside_the_lung_moves_with_the_spine_and_as_the_border_next_to_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    inward = np.array([-0.8, 0.36, -0.48])
+    beside, border = scene.CENTRE_CT + 46.0 * inward, (scene.CENTRE_CT + scene.RADIUS_MM * inward)[None]
+    observed = Watched(monkeypatch, hilum_ct=beside).observe(settings_of("balanced", COARSE))
+    both = scene.DEF_FROM_INF @ scene.INF_FROM_CT
+    expected = both(beside[None]) + in_def(border) - both(border)
+    assert_allclose(observed.hilum.point_ras, expected[0], atol=0.3)
 
 
 def test_a_hilum_that_is_switched_off_stands_still(watched: Watched) -> None:
