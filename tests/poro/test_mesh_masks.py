@@ -107,3 +107,16 @@ def test_dirty_masks_give_the_mesh_of_the_clean_one(spoil) -> None:  # type: ign
     assert mesh.volumes.sum() == pytest.approx(clean.volumes.sum(), rel=0.04)
     assert locate(clean, mesh.points).distance.max() < 7.0
     assert np.quantile(locate(clean, mesh.points).distance, 0.95) < 2.5
+
+
+@pytest.mark.parametrize("edge_mm", [8.0, 11.0, 14.0])
+def test_a_mesh_lies_where_its_mask_does_however_many_voxels_are_averaged(edge_mm: float) -> None:
+    """Voxels of 1.2, 1.6 and 2 mm: two, an odd and an even number of them lie in a quarter of an edge."""
+    spacing, centre = np.array([1.2, 1.6, 2.0]), np.array([12.0, -8.0, 20.0])
+    shape = np.ceil(90.0 / spacing).astype(int)
+    affine = np.diag([*spacing, 1.0])
+    affine[:3, 3] = centre - spacing * (shape - 1) / 2
+    x = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1) * spacing + affine[:3, 3]
+    mesh = stuff(np.linalg.norm(x - centre, axis=-1) < 40.0, affine, edge_mm)
+    middle = np.average(mesh.points, axis=0, weights=mesh.node_volumes)
+    assert_allclose(middle, centre, atol=0.3)

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import json
-import random
 import shutil
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +31,10 @@ from vatsloc.workflow.run import run_case
 from vatsloc.workflow.settings import load_settings
 
 TIMED = ("seconds", "peak_mb", "peak_mb_by_stage")
+REACHED_MM = [("phase1", 0.35, 0.70), ("phase2", 0.46, 0.91), ("chain", 0.56, 1.16)]
+"""Target registration error that the demo reaches with preset `fast`: mean and 95 % at its 48 landmarks. The rigid pose
+leaves 8.9, 16.1 and 23.4 mm on average."""
+NODULE_INFLATED_MM, NODULE_DEFLATED_MM = 0.25, 0.30
 
 
 @pytest.fixture(scope="module")
@@ -43,20 +45,19 @@ def case(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def bare_case(case: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The same case without landmarks and truth; case.toml still names the landmarks."""
-    folder = tmp_path_factory.mktemp("bare") / "demo"
+def blind_case(case: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same case with nonsense for landmarks and truth: who reads them stumbles."""
+    folder = tmp_path_factory.mktemp("blind") / "demo"
     shutil.copytree(case, folder)
-    shutil.rmtree(folder / "truth")
-    for path in folder.glob("landmarks_*"):
-        path.unlink()
+    for path in (*folder.glob("landmarks_*"), *folder.glob("truth/*")):
+        path.write_bytes(b"nonsense")
     return folder
 
 
 @pytest.fixture(scope="module")
-def result(case: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def result(blind_case: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("result") / "demo"
-    run_case(case, folder, load_settings("fast", None))
+    run_case(blind_case, folder, load_settings("fast", None))
     return folder
 
 
@@ -87,12 +88,36 @@ def test_run_holds_the_agreed_keys(run: dict[str, Any]) -> None:
     assert min(longest_first) > 0
 
 
-def test_chain_leaves_less_than_half_of_the_rigid_error(case: Path, result: Path, tmp_path: Path) -> None:
-    shutil.copytree(result, tmp_path / "r")
-    scores = evaluate_case(case, tmp_path / "r")
-    assert scores["phase1"]["mean"] < 1.0
-    assert scores["chain"]["mean"] < 0.5 * scores["rigid_ct_deflated"]["mean"]
-    assert scores["nodule_deflated_mm"] < 0.5 * scores["rigid_ct_deflated"]["mean"]
+def test_the_run_is_done_and_every_gate_holds(run: dict[str, Any]) -> None:
+    assert {name: gate["value"] for name, gate in run["gates"].items() if not gate["ok"]} == {}
+    assert run["status"] == "done"
+    spine = {f"spine_{kind}{pair}" for kind in ("", "slip_") for pair in ("ct_inflated", "inflated_deflated")}
+    seen = {"overlap", "deflated_surface", "surface", "fissures", "nodule_in_view"}
+    believed = {"registration_folds", "inverted_elements", "held_back", "agreement", "model_error", "ellipsoid"}
+    assert set(run["gates"]) == spine | seen | believed
+
+
+@pytest.fixture(scope="module")
+def scores(case: Path, result: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    copy = tmp_path_factory.mktemp("scored") / "r"
+    shutil.copytree(result, copy)
+    return evaluate_case(case, copy)
+
+
+@pytest.mark.parametrize(("stage", "mean", "p95"), REACHED_MM)
+def test_every_stage_is_within_twice_what_it_reaches(
+    scores: dict[str, Any], stage: str, mean: float, p95: float
+) -> None:
+    assert scores[stage]["n"] == 48
+    assert scores[stage]["mean"] < 2 * mean
+    assert scores[stage]["p95"] < 2 * p95
+
+
+def test_the_nodule_is_within_twice_what_it_reaches_and_inside_its_ellipsoid(scores: dict[str, Any]) -> None:
+    assert scores["nodule_inflated_mm"] < 2 * NODULE_INFLATED_MM
+    assert scores["nodule_deflated_mm"] < 2 * NODULE_DEFLATED_MM
+    assert scores["nodule_in_ellipsoid95"]
+    assert scores["in_radius95"]["landmarks"]["share"] > 0.9
 
 
 def test_fields_meshes_and_nodule_tell_the_same(case: Path, result: Path, run: dict[str, Any]) -> None:
@@ -156,8 +181,14 @@ def test_warped_ct_looks_like_the_deflated_cbct_in_the_lung(case: Path, result: 
     assert agreement > 0.8
 
 
-def test_landmarks_and_truth_change_nothing(bare_case: Path, result: Path, tmp_path: Path) -> None:
-    run_case(bare_case, tmp_path / "demo", load_settings("fast", None))
+@pytest.mark.study
+def test_a_second_run_without_landmarks_and_truth_writes_the_same(case: Path, result: Path, tmp_path: Path) -> None:
+    bare = tmp_path / "bare"
+    shutil.copytree(case, bare)
+    shutil.rmtree(bare / "truth")
+    for path in bare.glob("landmarks_*"):
+        path.unlink()
+    run_case(bare, tmp_path / "demo", load_settings("fast", None))
     for name in OUTPUT_FILES:
         if name not in ("run.json", "report.html", "scene.mrml"):  # the scene names the case's files
             assert _digest(tmp_path / "demo" / name) == _digest(result / name), name
@@ -165,16 +196,16 @@ def test_landmarks_and_truth_change_nothing(bare_case: Path, result: Path, tmp_p
     assert {k: v for k, v in here.items() if k not in TIMED} == {k: v for k, v in there.items() if k not in TIMED}
 
 
-def test_a_killed_run_leaves_no_result(bare_case: Path, tmp_path: Path) -> None:
+def test_a_killed_run_leaves_no_result(blind_case: Path, tmp_path: Path) -> None:
+    """Killed while it works; `test_formats_folder` kills the writing of results at many moments."""
     out = tmp_path / "out"
-    command = [sys.executable, "-m", "vatsloc", "localize", str(bare_case), "--out", str(out), "--preset", "fast"]
-    moments = random.Random(5)
-    for _ in range(4):
-        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        time.sleep(moments.uniform(1.0, 12.0))
+    command = [sys.executable, "-m", "vatsloc", "localize", str(blind_case), "--out", str(out), "--preset", "fast"]
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None
+        assert any("CT lungs ..." in line for line in process.stderr)
+        assert len(list(tmp_path.iterdir())) == 1  # the hidden folder that it fills
         process.send_signal(signal.SIGKILL)
-        process.wait()
-        assert not out.exists()
+    assert not out.exists()
 
 
 def _digest(path: Path) -> str:

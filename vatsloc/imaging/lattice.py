@@ -7,6 +7,9 @@ from scipy import ndimage
 
 from registration.volume import Array, Grid, Mask, Volume
 
+TIE_MM = 1e-6
+"""Spacings of a turned grid are rounded; a distance equal to the radius has to stay equal."""
+
 
 def working_copy(volume: Volume, spacing_mm: float) -> Volume:
     """Block means with axes turned to R, A, S and voxels about `spacing_mm` wide; a coarser axis stays."""
@@ -88,7 +91,7 @@ def dilate(inside: Array, radius_mm: float, spacing: Array) -> Array:
         return inside.copy()
     box = bounding_box(inside, np.ceil(radius_mm / spacing) + 1)
     out = np.zeros_like(inside)
-    out[box] = ndimage.distance_transform_edt(~inside[box], sampling=spacing) <= radius_mm
+    out[box] = ndimage.distance_transform_edt(~inside[box], sampling=spacing) <= radius_mm + TIE_MM
     return out
 
 
@@ -98,7 +101,7 @@ def erode(inside: Array, radius_mm: float, spacing: Array) -> Array:
         return inside.copy()
     box = bounding_box(inside, np.ceil(radius_mm / spacing) + 1)
     out = np.zeros_like(inside)
-    out[box] = ndimage.distance_transform_edt(inside[box], sampling=spacing) > radius_mm
+    out[box] = ndimage.distance_transform_edt(inside[box], sampling=spacing) > radius_mm + TIE_MM
     return out
 
 

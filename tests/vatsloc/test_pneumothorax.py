@@ -1,0 +1,179 @@
+"""How phase 2 is put together: which displacement goes where, in which frame, and what a choice leaves out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from poro.mesh import TetMesh
+from registration.matching import Pairs
+from registration.volume import Array
+from tests.vatsloc import ball_scene as scene
+from vatsloc.workflow import pneumothorax as module
+from vatsloc.workflow.ladder import Model, Rung
+from vatsloc.workflow.pneumothorax import RESIDUAL, Collapse, collapse, contact_surface, pneumothorax
+from vatsloc.workflow.pose import ChangeOfPose
+from vatsloc.workflow.residual import Residual
+from vatsloc.workflow.settings import settings_of
+from vatsloc.workflow.stages import Stages
+
+TRIED = Rung("regional fit", 3.0, 2.0, False)
+KEPT = Rung("elastic correction", 3.0, 1.2, True)
+
+
+class Parts:
+    """A pose, what was observed and a model that moves its own, coarser mesh by the scene's affine collapse."""
+
+    def __init__(self, rungs: Sequence[Rung] = ()) -> None:
+        mesh, both = scene.lung_mesh(), (scene.INF_FROM_CT, scene.DEF_FROM_INF)
+        inflated, before = scene.placed(mesh, *both[:1]), scene.placed(mesh, *both)
+        coarse = scene.placed(scene.lung_mesh(7.0), *both)
+        count = len(mesh.points)
+        self.pose: Any = ChangeOfPose(
+            scene.rigid_fit(scene.INF_FROM_CT.inverse()),
+            None,
+            scene.empty(scene.inflated()),
+            mesh,
+            inflated.points,
+            np.ones(count, bool),
+            None,
+            None,
+            1.0,
+        )
+        self.before, self.inflated, self.prepared, self.stages = before, inflated, scene.prepared(), Stages()
+        self.observed: Any = SimpleNamespace(
+            mesh_before=before,
+            model_mesh=coarse,
+            def_from_inf_rigid=scene.DEF_FROM_INF,
+            found=scene.pneumothorax(),
+            surface=scene.air_surface(40),
+        )
+        places = scene.CENTRE_DEF + np.random.default_rng(7).uniform(-20, 20, (9, 3))
+        self.pairs = Pairs(places, scene.collapsed(places), np.linspace(0.6, 1, 9))
+        system: Any = SimpleNamespace(mesh=coarse)
+        nothing: Any = None
+        moved = scene.collapsed(coarse.points) - coarse.points
+        self.model = Model(system, nothing, moved, self.pairs, tuple(rungs), nothing, np.zeros((0, 0, 3)))
+        self.asked: list[tuple[Any, ...]] = []
+
+    def run(self, monkeypatch: pytest.MonkeyPatch, images: Residual | None, **tables: Any) -> Collapse:
+        case: Any = SimpleNamespace(gravity_ras=np.array([1.0, 0, 0]))
+        settings = settings_of("balanced", tables)
+
+        def climb(gravity: Array, *rest: Any) -> Model:
+            assert_array_equal(gravity, case.gravity_ras)
+            assert rest == (self.prepared, self.observed, settings, self.stages)
+            return self.model
+
+        def correct(*values: Any) -> Residual | None:
+            self.asked.append(values)
+            return images
+
+        monkeypatch.setattr(module, "climb", climb)
+        monkeypatch.setattr(module, "residual_registration", correct)
+        return collapse(case, self.prepared, self.pose, self.observed, settings, self.stages)
+
+
+def correction(parts: Parts) -> Residual:
+    nodes = len(parts.before.points)
+    off = np.random.default_rng(3).normal(size=(nodes, 3))
+    return Residual(off, np.ones(nodes, bool), np.ones(nodes, bool), np.zeros(nodes), 0.5)
+
+
+def test_the_lungs_nodes_go_where_the_models_displacement_and_then_the_images_take_them(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    parts = Parts()
+    images = correction(parts)
+    found = parts.run(monkeypatch, images)
+    inner = scene.inner_nodes(parts.before, scene.CENTRE_DEF, 35.0)
+    truth = scene.collapsed(parts.before.points)
+    assert_allclose((found.points_after - images.displacement)[inner], truth[inner], atol=1e-6)
+    assert_array_equal(found.mesh_after.points, found.points_after)
+    assert_array_equal(found.mesh_after.tets, parts.before.tets)
+    assert found.residual is images
+    assert list(parts.stages.seconds) == [RESIDUAL]
+
+
+def test_the_residual_registration_is_asked_in_the_frames_of_the_scans(monkeypatch: pytest.MonkeyPatch) -> None:
+    parts = Parts()
+    parts.run(monkeypatch, None)
+    ((prepared, lung, model, before, surface, settings, pairs),) = parts.asked
+    assert prepared is parts.prepared
+    assert lung is parts.observed.found.lung
+    assert before is parts.before
+    assert surface is parts.observed.surface
+    assert settings == settings_of("balanced").residual
+    assert_allclose(scene.DEF_FROM_INF(pairs.first), parts.pairs.first)
+    assert_array_equal(pairs.second, parts.pairs.second)
+    assert_array_equal(pairs.ncc, parts.pairs.ncc)
+    assert_allclose(model(pairs.first), pairs.second, atol=1e-6)
+    far = np.array([[300.0, -200.0, 100.0]])
+    assert np.linalg.norm(model(far) - scene.DEF_FROM_INF(far)) < 20.0  # the rigid part is that of the spines
+    assert_array_equal(model.mesh.points, parts.inflated.points)
+
+
+@pytest.mark.parametrize(
+    ("rungs", "asked", "levels"), [((), 3, 3), ((TRIED,), 3, 3), ((TRIED, KEPT), 3, 2), ((KEPT,), 1, 1)]
+)
+def test_a_model_that_follows_places_needs_one_level_less(
+    monkeypatch: pytest.MonkeyPatch, rungs: tuple[Rung, ...], asked: int, levels: int
+) -> None:
+    parts = Parts(rungs)
+    parts.run(monkeypatch, None, residual={"levels": asked})
+    assert parts.asked[0][5].levels == levels
+
+
+def test_without_images_the_answer_is_the_models(monkeypatch: pytest.MonkeyPatch) -> None:
+    parts = Parts()
+    inner = scene.inner_nodes(parts.before, scene.CENTRE_DEF, 35.0)
+    truth = scene.collapsed(parts.before.points)
+    found = parts.run(monkeypatch, None)
+    assert found.residual is None
+    assert RESIDUAL not in parts.stages.skipped
+    assert_allclose(found.points_after[inner], truth[inner], atol=1e-6)
+    off = Parts()
+    found = off.run(monkeypatch, correction(off), residual={"on": False})
+    assert (found.residual, off.asked) == (None, [])
+    assert off.stages.skipped == {RESIDUAL: "switched off in the settings"}
+    assert_allclose(found.points_after[inner], truth[inner], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("rungs", "limit", "kept"), [((KEPT,), 1.1, True), ((KEPT,), 1.3, False), ((TRIED,), 2.9, True), ((), 90.0, True)]
+)
+def test_a_model_that_predicts_unseen_places_makes_the_images_superfluous(
+    monkeypatch: pytest.MonkeyPatch, rungs: tuple[Rung, ...], limit: float, kept: bool
+) -> None:
+    parts = Parts(rungs)
+    found = parts.run(monkeypatch, correction(parts), leave_out={"residual_mm": limit})
+    assert (found.residual is not None) is kept
+    (choice,) = parts.stages.choices
+    assert (choice.part, choice.kept, choice.limit) == (RESIDUAL, kept, limit)
+    assert choice.value == (parts.model.held_back_mm if rungs else np.inf)
+    assert (RESIDUAL in parts.stages.skipped) is not kept
+
+
+def test_a_collapse_shows_its_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    parts = Parts()
+    found = parts.run(monkeypatch, None)
+    assert found.def_from_inf_rigid is scene.DEF_FROM_INF
+    assert found.mesh_before is parts.before
+    assert found.system is parts.model.system
+    assert_array_equal(contact_surface(found).points, parts.before.boundary.points)
+    coarse: TetMesh = parts.observed.model_mesh
+    inner = scene.inner_nodes(parts.before, scene.CENTRE_DEF, 35.0)
+    assert_allclose(found.on_lung(coarse.points)[inner], parts.before.points[inner], atol=1e-6)
+
+
+def test_the_collapse_is_made_of_what_was_observed(monkeypatch: pytest.MonkeyPatch) -> None:
+    words: Any = [object() for _ in range(5)]
+    monkeypatch.setattr(module, "observe", lambda *values: ("observed", *values))
+    monkeypatch.setattr(module, "collapse", lambda *values: values)
+    case, prepared, pose, settings, stages = words
+    assert pneumothorax(*words) == (case, prepared, pose, ("observed", *words), settings, stages)
