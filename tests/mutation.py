@@ -1,0 +1,181 @@
+"""Do the tests notice? Puts single faults into the code that decides correctness and counts those that a test kills.
+
+    python tests/mutation.py --number 200 --seed 0 --out DIR [--only GLOB] [--jobs 1] [--end-to-end]
+
+Our own, since mutmut leaves out decorated functions (every numba kernel) and cosmic-ray has one test command for all
+modules, works in the checkout and draws no sample; neither knows which compiled kernels a change makes stale.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import queue
+import random
+import sys
+import tempfile
+import tomllib
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import asdict
+from fnmatch import fnmatch
+from functools import partial
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from tests.faults.copies import baseline, copy_tree, judge
+from tests.faults.imports import Imports
+from tests.faults.mutants import Mutant, mutants, sibling_fields
+from tests.faults.table import Name, Record, name_of, table
+
+ROOT = Path(__file__).resolve().parents[1]
+# Modules that decide correctness: the test files that judge them, () for those that import them, None for none.
+Scope = Mapping[str, tuple[str, ...] | None]
+SCOPE: Scope = {
+    "registration/**/*.py": (),
+    "poro/**/*.py": (),
+    "vatsloc/case.py": (),
+    "vatsloc/frames.py": (),
+    "vatsloc/maps.py": (),
+    "vatsloc/results.py": (),
+    "vatsloc/evaluation/**/*.py": (),
+    "vatsloc/formats/**/*.py": (),
+    "vatsloc/imaging/**/*.py": (),
+    "vatsloc/workflow/**/*.py": (),
+    "vatsloc/workflow/stages.py": None,  # seconds, memory and messages
+}
+DEMO = "tests/vatsloc/test_localize.py"
+DEMO_WORDS = ("-k", "not killed and not change_nothing")  # these run the demo again and judge how files are handled
+STEPS = 2  # a test judges what it imports, and what that imports
+BUDGET_S = 60.0  # of tests without a fault, nearest and fastest first, for one mutant
+JUDGED = "tests/mutation_judged.toml"
+
+
+def drawn(found: Iterable[Mutant], number: int, seed: int) -> list[Mutant]:
+    """Mutants drawn at random, one per place at most, every operator in turn; a larger number adds to a smaller."""
+    places: dict[str, dict[tuple[str, int, int], list[Mutant]]] = defaultdict(lambda: defaultdict(list))
+    for mutant in found:
+        places[mutant.operator][mutant.file, mutant.start, mutant.end].append(mutant)
+    chance = random.Random(seed)
+    piles = []
+    for operator in sorted(places):
+        pile = [chance.choice(places[operator][place]) for place in sorted(places[operator])]
+        chance.shuffle(pile)
+        piles.append(pile)
+    turns = range(max(map(len, piles), default=0))
+    return [pile[turn] for turn in turns for pile in piles if turn < len(pile)][:number]
+
+
+def within_reach(imports: Imports, file: str) -> dict[str, int]:
+    """Test files that import a module in few steps, or else those that need the fewest."""
+    tests = [test for test in imports.trees if test.startswith("tests/") and Path(test).name.startswith("test_")]
+    steps = {test: imports.reached(test).get(file) for test in tests if test != DEMO}
+    found = {test: step for test, step in steps.items() if step is not None}
+    limit = max(STEPS, min(found.values(), default=STEPS))
+    return {test: step for test, step in found.items() if step <= limit}
+
+
+def affordable(steps: Mapping[str, int], seconds: Mapping[str, float]) -> list[str]:
+    """Test files in the order they run, nearest and fastest first, as many as the budget allows."""
+    found: list[str] = []
+    for test in sorted(steps, key=lambda test: (steps[test], seconds[test])):
+        if not found or sum(seconds[name] for name in [*found, test]) <= BUDGET_S:
+            found.append(test)
+    return found
+
+
+def read_records(log: Path) -> dict[Name, Record]:
+    """Verdicts written so far, the last one where a mutant has several."""
+    lines = log.read_text(encoding="utf-8").splitlines() if log.exists() else []
+    return {name_of(record): record for record in map(json.loads, lines)}
+
+
+def work_off(tasks: Iterable[Callable[[Path], Record]], trees: Sequence[Path], log: Path) -> dict[Name, Record]:
+    """Run each task in a free copy of the tree and write its record as soon as it is there."""
+    free: queue.SimpleQueue[Path] = queue.SimpleQueue()
+    for tree in trees:
+        free.put(tree)
+
+    def in_free_tree(task: Callable[[Path], Record]) -> Record:
+        tree = free.get()
+        try:
+            return task(tree)
+        finally:
+            free.put(tree)
+
+    records: dict[Name, Record] = {}
+    with ThreadPoolExecutor(len(trees)) as pool, log.open("a", encoding="utf-8") as lines:
+        try:
+            for done in as_completed([pool.submit(in_free_tree, task) for task in tasks]):
+                record = done.result()
+                lines.write(json.dumps(record) + "\n")
+                lines.flush()
+                records[name_of(record)] = record
+                shown = (record.get(part, "") for part in ("file", "line", "operator", "verdict", "by", "demo"))
+                print(len(records), *shown, file=sys.stderr)
+        finally:
+            pool.shutdown(cancel_futures=True)
+    return records
+
+
+def judged(found: Sequence[Mutant], judges: Scope, imports: Imports, asked: argparse.Namespace) -> list[Record]:
+    """Verdicts on mutants: those written before, the others by the tests, where asked survivors by the demo run."""
+    log = asked.out / "mutants.jsonl"
+    sample = {name_of(asdict(mutant)): mutant for mutant in found}
+    records = {name: record for name, record in read_records(log).items() if name in sample}
+    waiting = [mutant for name, mutant in sample.items() if name not in records]
+    steps = {mutant.file: dict.fromkeys(judges[mutant.file] or (), 1) for mutant in waiting}
+    steps = {file: tests or within_reach(imports, file) for file, tests in steps.items()}
+
+    def by_tests(mutant: Mutant, tree: Path) -> Record:
+        tests = affordable(steps[mutant.file], seconds)
+        whole = sum(seconds[test] for test in tests)
+        return asdict(mutant) | {"tests": tests} | judge(tree, mutant, imports.compiled_with(mutant.file), tests, whole)
+
+    def by_demo(record: Record, tree: Path) -> Record:
+        mutant = sample[name_of(record)]
+        said = judge(tree, mutant, imports.compiled_with(mutant.file), [DEMO, *DEMO_WORDS], demo_seconds)
+        return record | {"demo": said["by"] or said["verdict"]}
+
+    with tempfile.TemporaryDirectory(prefix="mutation-") as base:
+        trees = [Path(base, str(job), "tree") for job in range(asked.jobs)]
+        copy_tree(imports.root, trees[0], asked.out)
+        seconds = baseline(trees[0], sorted({test for tests in steps.values() for test in tests}))
+        for tree in trees[1:]:
+            copy_tree(trees[0], tree, asked.out)
+        records |= work_off([partial(by_tests, mutant) for mutant in waiting], trees, log)
+        alive = [record for record in records.values() if record["verdict"] == "survived" and "demo" not in record]
+        if alive and asked.end_to_end:
+            demo_seconds = sum(baseline(trees[0], [DEMO], *DEMO_WORDS).values())
+            records |= work_off([partial(by_demo, record) for record in alive], trees, log)
+    return [records[name] for name in sample]
+
+
+def main(words: Sequence[str] | None = None, root: Path = ROOT, scope: Scope = SCOPE) -> None:
+    """The command line. root, scope: another tree and its modules, for the tests of this script."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--number", type=int, default=200, help="mutants to draw")
+    parser.add_argument("--seed", type=int, default=0, help="of the draw; a larger number adds to a smaller")
+    parser.add_argument("--out", type=Path, required=True, help="folder of mutants.jsonl and table.md, taken up again")
+    parser.add_argument("--only", default="*", help="glob of the modules' paths")
+    parser.add_argument("--jobs", type=int, default=1, help="mutants judged at a time, each in a copy of its own")
+    parser.add_argument("--end-to-end", action="store_true", help="put survivors to the demo run too")
+    asked = parser.parse_args(words)
+    asked.out.mkdir(parents=True, exist_ok=True)
+
+    imports = Imports(root)
+    judges = {path.relative_to(root).as_posix(): tests for glob, tests in scope.items() for path in root.glob(glob)}
+    files = sorted(file for file, tests in judges.items() if tests is not None and fnmatch(file, asked.only))
+    siblings = sibling_fields(imports.trees[file] for file in files)
+    found = [mutant for file in files for mutant in mutants(file, (root / file).read_text("utf-8"), siblings)]
+    records = judged(drawn(found, asked.number, asked.seed), judges, imports, asked)
+    reasons = root / JUDGED
+    entries = tomllib.loads(reasons.read_text("utf-8"))["judged"] if reasons.exists() else []
+    text = table(records, entries, asked.seed)
+    (asked.out / "table.md").write_text(text, encoding="utf-8")
+    print(text)
+
+
+if __name__ == "__main__":
+    main()
