@@ -67,6 +67,15 @@ def drawn(found: Iterable[Mutant], number: int, seed: int) -> list[Mutant]:
     return [pile[turn] for turn in turns for pile in piles if turn < len(pile)][:number]
 
 
+def in_scope(root: Path, scope: Scope) -> Scope:
+    """The scope's entry for each file of the tree, the last one that names it. Exits where an entry names no file."""
+    found = {glob: [path.relative_to(root).as_posix() for path in root.glob(glob)] for glob in scope}
+    for glob, files in found.items():
+        if not files:
+            raise SystemExit(f"SCOPE of tests/mutation.py: no file is {glob} any more; name where it went.")
+    return {file: scope[glob] for glob, files in found.items() for file in files}
+
+
 def within_reach(imports: Imports, file: str) -> dict[str, int]:
     """Test files that import a module in few steps, or else those that need the fewest."""
     tests = [test for test in imports.trees if test.startswith("tests/") and Path(test).name.startswith("test_")]
@@ -119,14 +128,14 @@ def work_off(tasks: Iterable[Callable[[Path], Record]], trees: Sequence[Path], l
     return records
 
 
-def judged(found: Sequence[Mutant], judges: Scope, imports: Imports, asked: argparse.Namespace) -> list[Record]:
+def verdicts(found: Sequence[Mutant], judges: Scope, imports: Imports, asked: argparse.Namespace) -> list[Record]:
     """Verdicts on mutants: those written before, the others by the tests, where asked survivors by the demo run."""
     log = asked.out / "mutants.jsonl"
     sample = {name_of(asdict(mutant)): mutant for mutant in found}
     records = {name: record for name, record in read_records(log).items() if name in sample}
     waiting = [mutant for name, mutant in sample.items() if name not in records]
-    steps = {mutant.file: dict.fromkeys(judges[mutant.file] or (), 1) for mutant in waiting}
-    steps = {file: tests or within_reach(imports, file) for file, tests in steps.items()}
+    files = {mutant.file for mutant in waiting}
+    steps = {file: dict.fromkeys(judges[file] or (), 1) or within_reach(imports, file) for file in files}
 
     def by_tests(mutant: Mutant, tree: Path) -> Record:
         tests = affordable(steps[mutant.file], seconds)
@@ -165,11 +174,11 @@ def main(words: Sequence[str] | None = None, root: Path = ROOT, scope: Scope = S
     asked.out.mkdir(parents=True, exist_ok=True)
 
     imports = Imports(root)
-    judges = {path.relative_to(root).as_posix(): tests for glob, tests in scope.items() for path in root.glob(glob)}
+    judges = in_scope(root, scope)
     files = sorted(file for file, tests in judges.items() if tests is not None and fnmatch(file, asked.only))
     siblings = sibling_fields(imports.trees[file] for file in files)
     found = [mutant for file in files for mutant in mutants(file, (root / file).read_text("utf-8"), siblings)]
-    records = judged(drawn(found, asked.number, asked.seed), judges, imports, asked)
+    records = verdicts(drawn(found, asked.number, asked.seed), judges, imports, asked)
     reasons = root / JUDGED
     entries = tomllib.loads(reasons.read_text("utf-8"))["judged"] if reasons.exists() else []
     text = table(records, entries, asked.seed)

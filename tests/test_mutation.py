@@ -155,6 +155,15 @@ def test_a_draw_repeats_and_a_larger_one_adds_to_it() -> None:
     assert [mutant.operator for mutant in everything[:4]] == ["arithmetic", "constant", "index", "arithmetic"]
 
 
+def test_scope_names_files_that_are_there(tree: Path) -> None:
+    files = mutation.in_scope(mutation.ROOT, mutation.SCOPE)
+    assert files["vatsloc/workflow/localize.py"] == ()
+    assert files["vatsloc/workflow/stages.py"] is None
+    assert (mutation.ROOT / mutation.DEMO).is_file()
+    with pytest.raises(SystemExit, match=r"no file is gone\.py"):
+        mutation.in_scope(tree, {"ages.py": (), "gone.py": ()})
+
+
 def test_tests_are_found_by_their_imports_nearest_and_fastest_first(tmp_path: Path) -> None:
     for file, text in {
         "pack/__init__.py": "from pack.inner import f",
