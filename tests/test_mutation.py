@@ -183,7 +183,9 @@ def test_tests_are_found_by_their_imports_nearest_and_fastest_first(tmp_path: Pa
     assert mutation.within_reach(imports, "pack/inner.py") == {near: 1, scene: 2}
     assert mutation.within_reach(imports, "far.py") == {near: 2}
     assert mutation.within_reach(imports, "farther.py") == {near: 3}
-    assert mutation.affordable({"a": 2, "b": 1, "c": 1, "d": 2}, {"a": 1, "b": 9, "c": 2, "d": 100}) == ["c", "b", "a"]
+    assert mutation.first_in_turn({"a": 2, "b": 1, "c": 1}, {"a": 1, "b": 9, "c": 2}) == ["c", "b", "a"]
+    many = {str(step): step for step in range(20)}
+    assert mutation.first_in_turn(many, dict.fromkeys(many, 1.0)) == list(many)[: mutation.MOST]
 
 
 def test_kernels_are_stale_with_what_they_hold(tmp_path: Path) -> None:
