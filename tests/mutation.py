@@ -136,24 +136,26 @@ def verdicts(found: Sequence[Mutant], judges: Scope, imports: Imports, asked: ar
 
     def by_tests(mutant: Mutant, tree: Path) -> Record:
         tests = first_in_turn(steps[mutant.file], seconds)
-        whole = sum(seconds[test] for test in tests)
-        return asdict(mutant) | {"tests": tests} | judge(tree, mutant, imports.compiled_with(mutant.file), tests, whole)
+        usual = sum(seconds[test] for test in tests)
+        said = judge(tree, mutant, imports.compiled_with(mutant.file), [*tests, *without] if tests else [], usual)
+        return asdict(mutant) | {"tests": tests} | said
 
     def by_demo(record: Record, tree: Path) -> Record:
         mutant = sample[name_of(record)]
-        said = judge(tree, mutant, imports.compiled_with(mutant.file), [DEMO, *DEMO_WORDS], demo_seconds)
+        said = judge(tree, mutant, imports.compiled_with(mutant.file), [DEMO, *DEMO_WORDS, *without], demo_seconds)
         return record | {"demo": said["by"] or said["verdict"]}
 
+    without = [f"--deselect={test}" for test in asked.deselect]
     with tempfile.TemporaryDirectory(prefix="mutation-") as base:
         trees = [Path(base, str(job), "tree") for job in range(asked.jobs)]
         copy_tree(imports.root, trees[0], asked.out)
-        seconds = baseline(trees[0], sorted({test for tests in steps.values() for test in tests}))
+        seconds = baseline(trees[0], sorted({test for tests in steps.values() for test in tests}), *without)
         for tree in trees[1:]:
             copy_tree(trees[0], tree, asked.out)
         records |= work_off([partial(by_tests, mutant) for mutant in waiting], trees, log)
         alive = [record for record in records.values() if record["verdict"] == "survived" and "demo" not in record]
         if alive and asked.end_to_end:
-            demo_seconds = sum(baseline(trees[0], [DEMO], *DEMO_WORDS).values())
+            demo_seconds = sum(baseline(trees[0], [DEMO], *DEMO_WORDS, *without).values())
             records |= work_off([partial(by_demo, record) for record in alive], trees, log)
     return [records[name] for name in sample]
 
@@ -167,6 +169,7 @@ def main(words: Sequence[str] | None = None, root: Path = ROOT, scope: Scope = S
     parser.add_argument("--only", default="*", help="glob of the modules' paths")
     parser.add_argument("--jobs", type=int, default=1, help="mutants judged at a time, each in a copy of its own")
     parser.add_argument("--end-to-end", action="store_true", help="put survivors to the demo run too")
+    parser.add_argument("--deselect", action="append", default=[], help="test that fails here without a fault too")
     asked = parser.parse_args(words)
     asked.out.mkdir(parents=True, exist_ok=True)
 

@@ -249,10 +249,17 @@ def test_a_mutant_that_hangs_is_ended_in_time(tree: Path, monkeypatch: pytest.Mo
     assert time.monotonic() - start < 20
 
 
-def test_tests_that_fail_without_a_fault_end_the_run(tree: Path, tmp_path: Path) -> None:
+def test_tests_that_fail_without_a_fault_end_the_run_unless_left_out(tree: Path, tmp_path: Path) -> None:
     (tree / "tests" / "test_ages.py").write_text(TEST_AGES.replace("assert not", "assert"))
+    (tree / "tests" / "test_first.py").write_text(
+        "from ages import first\n\n\ndef test_first(): assert first([1]) == 1\n"
+    )
+    words = ["--out", str(tmp_path), "--number", "1"]
     with pytest.raises(SystemExit, match="mend them first"):
-        mutation.main(["--out", str(tmp_path / "out"), "--number", "1"], tree, {"ages.py": ()})
+        mutation.main(words, tree, {"ages.py": ()})
+    mutation.main([*words, "--deselect", "tests/test_ages.py::test_adult"], tree, {"ages.py": ()})
+    (record,) = map(json.loads, (tmp_path / "mutants.jsonl").read_text().splitlines())
+    assert (record["operator"], record["verdict"]) == ("comparison", "survived")
 
 
 def test_what_does_not_compile_is_no_kill(tree: Path) -> None:
