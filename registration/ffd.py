@@ -10,16 +10,16 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from registration.bspline import BSplineField, control_grid
-from registration.corrected import CorrectedMap, on_grid
-from registration.field import DisplacementField, PointMap
-from registration.metric import GlobalNcc, LocalNcc
-from registration.newton import Descent, Stop, gauss_newton
-from registration.objective import Objective, Term
-from registration.penalties import Bending, Departure, Folding, Keypoints, Matches
-from registration.pyramid import Images, Pyramid, cropped
-from registration.rigid import RigidTransform
-from registration.similarity import ImageTerm, Metric
+from registration.images.pyramid import Images, Pyramid, cropped
+from registration.maps.bspline import BSplineField, control_grid
+from registration.maps.composite import CorrectedMap, on_grid
+from registration.maps.field import DisplacementField, PointMap
+from registration.maps.rigid import RigidTransform
+from registration.terms.gauss_newton import Descent, Stop, gauss_newton
+from registration.terms.image_term import ImageTerm, Metric
+from registration.terms.metrics import GlobalNcc, LocalNcc
+from registration.terms.objective import Objective, Term
+from registration.terms.penalties import Bending, Departure, Folding, Keypoints, Matches
 from registration.volume import Array, Grid, Mask, Volume
 
 Progress = Callable[[str, float], None]

@@ -12,14 +12,14 @@ from math import ceil, log2
 
 import numpy as np
 
-from registration.corrected import on_grid
 from registration.ffd import FfdFit, FfdSettings, Weights, register_ffd
-from registration.field import PointMap
-from registration.matching import MatchSettings, match_keypoints
-from registration.nearby import bounding_box, grown
-from registration.penalties import Keypoints
-from registration.resample import coarsen, resample, resample_mask
-from registration.rigid import RigidTransform
+from registration.images.morphology import bounding_box, grown
+from registration.images.resample import coarsen, resample, resample_mask
+from registration.keypoints.matching import MatchSettings, match_keypoints
+from registration.maps.composite import on_grid
+from registration.maps.field import PointMap
+from registration.maps.rigid import RigidTransform
+from registration.terms.penalties import Keypoints
 from registration.volume import Cut, Mask, Volume
 
 OUTSIDE_HU = -1100.0

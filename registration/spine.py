@@ -13,11 +13,11 @@ from numba import njit, prange
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
-from registration.interpolate import interpolate, warp_samples
-from registration.metric import GlobalNcc
-from registration.pyramid import Pyramid
-from registration.resample import coarsen, coarsen_mask
-from registration.rigid import RigidTransform
+from registration.images.interpolate import interpolate, warp_samples
+from registration.images.pyramid import Pyramid
+from registration.images.resample import coarsen, coarsen_mask
+from registration.maps.rigid import RigidTransform
+from registration.terms.metrics import GlobalNcc
 from registration.volume import Array, Mask, Volume
 
 BONE_WINDOW = (-150.0, 700.0)

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from registration.bspline import BSplineField, control_grid
 from registration.ffd import FfdSettings, Weights, register_ffd
-from registration.nearby import grown
-from registration.newton import Stop
-from registration.penalties import Keypoints
-from registration.rigid import RigidTransform
+from registration.images.morphology import grown
+from registration.maps.bspline import BSplineField, control_grid
+from registration.maps.rigid import RigidTransform
 from registration.sliding import finest_weights, masked, register_sliding
+from registration.terms.gauss_newton import Stop
+from registration.terms.penalties import Keypoints
 from registration.volume import Array, Grid, Mask, Volume
 from tests.registration.scenes import image_of, make_pattern, oriented
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from registration.matching import MatchSettings, alike, distinctiveness, match_keypoints
+from registration.keypoints.matching import MatchSettings, alike, distinctiveness, match_keypoints
 from registration.volume import Mask, Volume
 from tests.registration.scenes import image_of, make_pattern, oriented
 

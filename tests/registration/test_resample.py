@@ -7,9 +7,9 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from registration.field import DisplacementField, sample_map
-from registration.resample import coarsen, resample, resample_mask, smooth
-from registration.rigid import RigidTransform
+from registration.images.resample import coarsen, resample, resample_mask, smooth
+from registration.maps.field import DisplacementField, sample_map
+from registration.maps.rigid import RigidTransform
 from registration.volume import Array, Grid, Mask, Volume
 from tests.registration.scenes import image_of, make_pattern, oriented, tilted
 

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from registration.bspline import control_grid
-from registration.metric import GlobalNcc, LocalNcc, box_sums
-from registration.objective import Objective, Term
-from registration.penalties import Bending, Departure, Folding, Keypoints, Matches
-from registration.rigid import RigidTransform
-from registration.similarity import ImageTerm, Samples
-from registration.stretch import Stretch, barrier, cofactor, determinant
+from registration.maps.bspline import control_grid
+from registration.maps.jacobian import Stretch, barrier, cofactor, determinant
+from registration.maps.rigid import RigidTransform
+from registration.terms.image_term import ImageTerm, Samples
+from registration.terms.metrics import GlobalNcc, LocalNcc, box_sums
+from registration.terms.objective import Objective, Term
+from registration.terms.penalties import Bending, Departure, Folding, Keypoints, Matches
 from registration.volume import Grid, Volume
 from tests.registration.scenes import image_of, make_pattern, oriented
 

@@ -12,8 +12,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 from poro.mesh import TetMesh, stuff
-from registration.matching import Pairs
-from registration.rigid import RigidTransform
+from registration.keypoints.matching import Pairs
+from registration.maps.rigid import RigidTransform
 from vatsloc.workflow.certainty import MODEL_ALONE_MM, covariance, place_sigma_mm, radius95, scatter
 
 QUANTILE = np.sqrt(7.814728)  # of chi-squared with three degrees of freedom, 95 %

@@ -10,7 +10,7 @@ import pytest
 
 from phantoms.cbct import Scanner
 from phantoms.spec import SPECS, Collapse, Lesion, PhantomSpec
-from registration.penalties import Keypoints
+from registration.terms.penalties import Keypoints
 from vatsloc.phantom_case import write_phantom
 from vatsloc.study.choices import LIMITS, Tried, table, try_choices
 from vatsloc.workflow.choices import Choice, weigh

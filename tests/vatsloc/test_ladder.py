@@ -15,7 +15,7 @@ from poro.mesh import TetMesh, stuff
 from poro.model import Theta, assemble, solve
 from poro.observations import Target
 from poro.tissue import Tissue
-from registration.matching import Pairs
+from registration.keypoints.matching import Pairs
 from vatsloc.workflow.ladder import NO_OTHERS, Model, Step, best_of, corrected, held_back, misfit
 from vatsloc.workflow.spread import other_answers
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from registration.field import PointMap
-from registration.resample import resample_mask
+from registration.images.resample import resample_mask
+from registration.maps.field import PointMap
 from registration.volume import Array, Grid, Mask, Volume
 from vatsloc.errors import InputRefused
 from vatsloc.imaging.airways import TrackedAirways, track_airways

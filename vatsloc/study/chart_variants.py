@@ -8,14 +8,14 @@ from enum import Enum
 from math import inf
 from typing import Any, cast
 
-from registration.corrected import CorrectedMap
 from registration.ffd import FfdFit, FfdSettings, register_ffd
-from registration.field import PointMap, compose
-from registration.nearby import grown
-from registration.newton import Stop
-from registration.resample import coarsen, resample_mask
-from registration.rigid import RigidTransform
+from registration.images.morphology import grown
+from registration.images.resample import coarsen, resample_mask
+from registration.maps.composite import CorrectedMap
+from registration.maps.field import PointMap, compose
+from registration.maps.rigid import RigidTransform
 from registration.sliding import BEYOND_MM, masked, register_sliding
+from registration.terms.gauss_newton import Stop
 from registration.volume import Mask, Volume
 from vatsloc.errors import CaseError
 from vatsloc.study.elastix import ElastixSettings, run_elastix

@@ -8,9 +8,9 @@ from enum import Enum
 import numpy as np
 
 from registration.ffd import FfdSettings, Weights, register_ffd
-from registration.field import PointMap
-from registration.inversion import invert_at
-from registration.rigid import RigidTransform
+from registration.maps.field import PointMap
+from registration.maps.inversion import invert_at
+from registration.maps.rigid import RigidTransform
 from registration.volume import Array, Mask
 from vatsloc.imaging.cbct import PreparedCbct
 from vatsloc.imaging.hilum import Hilum, track_hilum

@@ -21,7 +21,7 @@ from poro.model import PoroStatus, PoroSystem, assemble
 from poro.modes import hilum_modes, shape_modes
 from poro.observations import Target
 from poro.tissue import Tissue
-from registration.matching import Pairs
+from registration.keypoints.matching import Pairs
 from registration.volume import Array
 from vatsloc.imaging.surface import Border, SurfacePoints
 from vatsloc.workflow.choices import Choice

@@ -5,9 +5,9 @@ on where those that were found do.
 from __future__ import annotations
 
 from poro.mesh import TetMesh
-from registration.growing import GrowSettings, grow
-from registration.matching import MatchSettings, Pairs, match_keypoints
-from registration.resample import coarsen, resample_mask
+from registration.images.resample import coarsen, resample_mask
+from registration.keypoints.matching import MatchSettings, Pairs, match_keypoints
+from registration.keypoints.propagation import GrowSettings, grow
 from registration.volume import Array, Mask, Volume
 from vatsloc.imaging.lattice import erode
 from vatsloc.maps import MeshMap, covered

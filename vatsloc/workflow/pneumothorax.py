@@ -10,7 +10,7 @@ from poro.fit import Fit
 from poro.identify import Identifiability, identifiability
 from poro.mesh import TetMesh, TriSurface, interpolate, locate
 from poro.model import PoroSystem
-from registration.rigid import RigidTransform
+from registration.maps.rigid import RigidTransform
 from registration.volume import Array
 from vatsloc.case import Case
 from vatsloc.maps import MeshMap

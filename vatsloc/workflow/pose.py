@@ -13,13 +13,13 @@ from poro.extrapolate import Extrapolation, extrapolate
 from poro.mesh import TetMesh, stuff
 from poro.tissue import Tissue
 from registration.ffd import FfdFit, FfdSettings, Weights
-from registration.field import PointMap
-from registration.inversion import Inversion, invert_at
-from registration.penalties import Keypoints
-from registration.resample import coarsen_mask
-from registration.rigid import RigidTransform
+from registration.images.resample import coarsen_mask
+from registration.maps.field import PointMap
+from registration.maps.inversion import Inversion, invert_at
+from registration.maps.rigid import RigidTransform
 from registration.sliding import register_sliding
 from registration.spine import RigidFit, SpineSearch, register_spine
+from registration.terms.penalties import Keypoints
 from registration.volume import Array, Mask
 from vatsloc.case import Case
 from vatsloc.imaging.lungs import Side

@@ -17,9 +17,9 @@ from poro.extrapolate import extrapolate
 from poro.mesh import TetMesh
 from poro.tissue import Tissue
 from registration.ffd import FfdSettings, Weights, register_ffd
-from registration.inversion import invert_at
-from registration.matching import Pairs
-from registration.penalties import Keypoints
+from registration.keypoints.matching import Pairs
+from registration.maps.inversion import invert_at
+from registration.terms.penalties import Keypoints
 from registration.volume import Array, Mask
 from vatsloc.imaging.lattice import dilate, erode
 from vatsloc.imaging.surface import Border, SurfacePoints

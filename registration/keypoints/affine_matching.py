@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit, prange
 
-from registration.matching import FLAT_HU, between_voxels
+from registration.keypoints.matching import FLAT_HU, between_voxels
 from registration.volume import Array
 
 LEAST_INSIDE = 0.35

@@ -9,13 +9,13 @@ from typing import Protocol
 
 import numpy as np
 
-from registration.bspline import Lattice
-from registration.corrected import is_separable
-from registration.field import PointMap
-from registration.interpolate import interpolate, warp_samples
-from registration.metric import Similarity
-from registration.objective import Model
-from registration.stretch import Stretch, cofactor, determinant
+from registration.images.interpolate import interpolate, warp_samples
+from registration.maps.bspline import Lattice
+from registration.maps.composite import is_separable
+from registration.maps.field import PointMap
+from registration.maps.jacobian import Stretch, cofactor, determinant
+from registration.terms.metrics import Similarity
+from registration.terms.objective import Model
 from registration.volume import Array, Grid, Volume
 
 BLOCK = 2
@@ -23,7 +23,7 @@ HESSIAN_BLOCK = 4
 
 
 class Metric(Protocol):
-    """A dissimilarity of the samples; see `registration.metric`."""
+    """A dissimilarity of the samples; see `registration.terms.metrics`."""
 
     def evaluate(self, m: Array, w: Array) -> Similarity: ...
 

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import sparse
 
-from registration.bending import BendingEnergy
-from registration.bspline import Lattice, basis_rows
-from registration.field import PointMap
-from registration.objective import Model
-from registration.stretch import Stretch, barrier, cofactor, determinant
+from registration.maps.bspline import Lattice, basis_rows
+from registration.maps.field import PointMap
+from registration.maps.jacobian import Stretch, barrier, cofactor, determinant
+from registration.terms.bending import BendingEnergy
+from registration.terms.objective import Model
 from registration.volume import Array, Grid
 
 
@@ -114,7 +114,7 @@ class Matches:
 
 
 class Folding:
-    """weight times the mean over blocks of a barrier on det(dT/dx); see `registration.stretch.barrier`."""
+    """weight times the mean over blocks of a barrier on det(dT/dx); see `registration.maps.jacobian.barrier`."""
 
     def __init__(self, control: Grid, blocks: Grid, prior: PointMap, weight: float) -> None:
         self._stretch = Stretch(control, blocks, prior)

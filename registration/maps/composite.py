@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TypeGuard
 
-from registration.bspline import BSplineField, parallel
-from registration.field import DisplacementField, PointMap, sample_map
+from registration.maps.bspline import BSplineField, parallel
+from registration.maps.field import DisplacementField, PointMap, sample_map
 from registration.volume import Array, Grid
 
 

@@ -12,7 +12,7 @@ from numba import njit, prange
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from registration.resample import resample, resample_mask
+from registration.images.resample import resample, resample_mask
 from registration.volume import Array, Mask, Volume
 
 FLAT_HU = 15.0

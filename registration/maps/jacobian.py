@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from registration.banded import Banded, along_axes
-from registration.bspline import basis_derivative
-from registration.corrected import is_separable
-from registration.field import PointMap
+from registration.kernels.banded import Banded, along_axes
+from registration.maps.bspline import basis_derivative
+from registration.maps.composite import is_separable
+from registration.maps.field import PointMap
 from registration.volume import Array, Grid
 
 KNEE = 0.3

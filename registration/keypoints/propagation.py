@@ -14,9 +14,9 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from registration.matching import MatchSettings, Pairs, distinctive_places, smoothed
-from registration.resample import resample, resample_mask
-from registration.turned import Inside, find_turned
+from registration.images.resample import resample, resample_mask
+from registration.keypoints.affine_matching import Inside, find_turned
+from registration.keypoints.matching import MatchSettings, Pairs, distinctive_places, smoothed
 from registration.volume import Array, Grid, Mask, Volume
 
 ROUNDS = 12

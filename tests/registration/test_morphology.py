@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from registration.nearby import bounding_box, near
+from registration.images.morphology import bounding_box, near
 
 
 @pytest.mark.parametrize("spacing", [(1.0, 1.0, 1.0), (1.0, 0.8, 2.5), (3.0, 2.9, 3.1)])

@@ -8,7 +8,7 @@ from enum import Enum
 
 import numpy as np
 
-from registration.objective import Model, Term
+from registration.terms.objective import Model, Term
 from registration.volume import Array
 
 

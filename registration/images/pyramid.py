@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from registration.nearby import bounding_box
-from registration.resample import coarsen, coarsen_mask
-from registration.similarity import Samples
+from registration.images.morphology import bounding_box
+from registration.images.resample import coarsen, coarsen_mask
+from registration.terms.image_term import Samples
 from registration.volume import Array, Mask, Volume
 
 

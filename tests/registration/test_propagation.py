@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from registration.growing import GrowSettings, grow, local_maps, seconded
-from registration.matching import MatchSettings, Pairs
-from registration.turned import Inside, find_turned
+from registration.keypoints.affine_matching import Inside, find_turned
+from registration.keypoints.matching import MatchSettings, Pairs
+from registration.keypoints.propagation import GrowSettings, grow, local_maps, seconded
 from registration.volume import Array, Grid, Mask, Volume
 from tests.registration.scenes import Pattern, image_of, make_pattern, oriented, tilted
 
