@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from registration.images.interpolate import interpolate, warp_samples
 from registration.images.pyramid import Pyramid
 from registration.images.resample import coarsen, coarsen_mask
+from registration.kernels.correlation import coefficient
 from registration.maps.rigid import RigidTransform
 from registration.terms.metrics import GlobalNcc
 from registration.volume import Array, Mask, Volume
@@ -93,13 +94,13 @@ def register_spine(
     centre = fixed_spine.grid.to_ras(np.argwhere(fixed_spine.inside).mean(axis=0))
     coarse, middle, fine = _pairs(fixed, moving, fixed_spine, fixed_seen, moving_seen, search.surroundings_mm)
     poses = _coarse(coarse, centre, initial, search, moving_spine)
-    best = _climbed(poses, (middle, fine), centre, 4)
+    best = _refined(poses, (middle, fine), centre, 4)
     if not best:
         return RigidFit(initial, RigidStatus.POOR, -1.0, -1.0, 0.0, 0.0)
     pose, ncc = best[0]
     axis = _spine_axis(fixed_spine)
     slips = [pose @ _shift(s * axis) for s in (-42.0, -30.0, -20.0, 20.0, 30.0, 42.0)]
-    others = [item for item in best[1:] + _climbed(slips, (middle, fine), centre, 3) if _far(item[0], pose, centre)]
+    others = [item for item in best[1:] + _refined(slips, (middle, fine), centre, 3) if _far(item[0], pose, centre)]
     second, second_ncc = max(others, key=lambda item: item[1], default=(pose, -1.0))
     status = RigidStatus.FOUND
     if ncc < search.least_ncc:
@@ -146,7 +147,7 @@ def _pairs(
     return pairs[::-1]
 
 
-def _climbed(
+def _refined(
     starts: list[RigidTransform], pairs: tuple[_Pair, _Pair], centre: Array, most: int
 ) -> list[tuple[RigidTransform, float]]:
     """Distinct poses refined at both resolutions with their correlations, best first."""
@@ -168,19 +169,19 @@ def _coarse(
     shifts = shifts[np.linalg.norm(shifts, axis=1) <= search.shift_mm + 1e-6]
     if moving_spine is not None:
         shifts = shifts[_near_spine(moving_spine, initial(centre[None])[0] + shifts)]
-    turns = _turns(search.angle_degrees)
+    rotations = _rotations(search.angle_degrees)
     ijk = pair.moving.grid.ijk_from_ras
     relative = pair.points - centre
-    base = np.stack([relative @ (ijk[:3, :3] @ initial.matrix[:3, :3] @ r).T for r in turns])
+    base = np.stack([relative @ (ijk[:3, :3] @ initial.matrix[:3, :3] @ r).T for r in rotations])
     target = pair.moving.grid.to_ijk(initial(centre[None])[0] + shifts)
-    scores = np.empty((len(turns), len(shifts)), dtype=np.float32)
+    scores = np.empty((len(rotations), len(shifts)), dtype=np.float32)
     unseen = np.where(pair.seen.hu > 0.9, pair.moving.hu, np.float32(2 * UNSEEN))
     _scores(np.ascontiguousarray(unseen), base.astype(np.float32), target.astype(np.float32), pair.values, scores)
     kept: list[RigidTransform] = []
     for flat in np.argsort(-scores, axis=None)[:4000]:
         t, s = np.unravel_index(flat, scores.shape)
         m = np.eye(4)
-        m[:3, :3] = initial.matrix[:3, :3] @ turns[t]
+        m[:3, :3] = initial.matrix[:3, :3] @ rotations[t]
         m[:3, 3] = initial(centre[None])[0] + shifts[s] - m[:3, :3] @ centre
         pose = RigidTransform(m)
         if scores[t, s] > 0 and all(
@@ -192,7 +193,7 @@ def _coarse(
     return kept
 
 
-def _turns(half_width: float) -> list[Array]:
+def _rotations(half_width: float) -> list[Array]:
     """Rotations on a grid of rotation vectors, about 12 degrees apart, up to `half_width` degrees."""
     n = max(int(np.ceil(half_width / 13)), 1)
     ticks = np.linspace(-half_width, half_width, 2 * n + 1) * 0.9
@@ -210,9 +211,9 @@ def _near_spine(spine: Mask, points: Array, reach_mm: float = 30.0) -> Array:
 @njit(cache=True, parallel=True, fastmath=True)
 def _scores(voxels, base, target, values, scores):
     ni, nj, nk = voxels.shape
-    turns, n, _ = base.shape
+    rotations, n, _ = base.shape
     for s in prange(target.shape[0]):
-        for t in range(turns):
+        for t in range(rotations):
             count, sf, sm, sff, smm, sfm = 0, 0.0, 0.0, 0.0, 0.0, 0.0
             for p in range(n):
                 x, y, z = base[t, p, 0] + target[s, 0], base[t, p, 1] + target[s, 1], base[t, p, 2] + target[s, 2]
@@ -227,9 +228,7 @@ def _scores(voxels, base, target, values, scores):
                 sff, smm, sfm = sff + f * f, smm + m * m, sfm + f * m
             scores[t, s] = -1.0
             if count >= 0.6 * n:
-                vf, vm = sff - sf * sf / count, smm - sm * sm / count
-                if vf > 0 and vm > 0:
-                    scores[t, s] = (sfm - sf * sm / count) / np.sqrt(vf * vm)
+                scores[t, s] = coefficient(count, sf, sm, sff, smm, sfm, 0.0, 0.0)
 
 
 def _refine(pair: _Pair, pose: RigidTransform, centre: Array, steps: int) -> tuple[RigidTransform, float]:

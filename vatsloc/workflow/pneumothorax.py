@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -105,7 +105,7 @@ def collapse(
             before,
             observed.surface,
             chosen,
-            replace(model.pairs, first=rigid.inverse()(model.pairs.first)),
+            model.pairs.mapped(moving=rigid.inverse()),
         )
     return Collapse(observed, model, residual, after if residual is None else after + residual.displacement)
 
