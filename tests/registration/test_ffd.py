@@ -133,10 +133,10 @@ def test_a_lung_slides_past_a_wall_that_stays() -> None:
         return Mask(np.hypot(*np.moveaxis(g.points() - CENTRE, 3, 0)[:2]) < radius, g.ras_from_ijk)
 
     fit = register_sliding(fixed, moving, tube(WIDE), COARSE, fixed_lung=tube(grid))
-    led = register_sliding(fixed, moving, tube(WIDE), COARSE, fixed_lung=tube(grid), coarse_beyond_mm=12.5)
+    led = register_sliding(fixed, moving, tube(WIDE), COARSE, fixed_lung=tube(grid), coarse_beyond_mm=14.0)
     assert (fit.coarse, led.coarse) == (True, False)
     assert fit.matched == led.matched > 20
-    assert fit.moved_mm == led.moved_mm == pytest.approx(np.linalg.norm(slide), abs=0.4)
+    assert fit.moved_mm == led.moved_mm == pytest.approx(np.linalg.norm(slide), abs=1.0)
     rng = np.random.default_rng(5)
     angle, r = rng.uniform(0, 2 * np.pi, 200), rng.uniform(26, 34, 200)
     near = CENTRE + np.stack([r * np.cos(angle), r * np.sin(angle), rng.uniform(-20, 20, 200)], axis=1)

@@ -85,6 +85,14 @@ def test_coarsening_and_smoothing_keep_linear_scenes_and_damp_waves_as_a_gaussia
     assert_allclose(damped, wave.hu[:, :, 10:-10] * np.exp(-2 * (np.pi * 2 / 12) ** 2), atol=0.5)
 
 
+def test_a_displacement_field_of_one_slice_is_linear_along_the_others() -> None:
+    vectors = np.zeros((2, 3, 1, 3))
+    vectors[1, :, 0, 1] = 4.0
+    field = DisplacementField(vectors, np.diag([2.0, 2.0, 5.0, 1.0]))
+    points = np.array([[0.5, 1.0, 0.0], [1.5, 3.0, 2.0], [9.0, 0.0, -7.0]])
+    assert_allclose(field.displacement(points), [[0, 1, 0], [0, 3, 0], [0, 4, 0]], atol=1e-12)
+
+
 def test_a_displacement_field_refuses_scalars() -> None:
     with pytest.raises(ValueError, match=r"\(ni, nj, nk, 3\), got \(2, 2, 2\)"):
         DisplacementField(np.zeros((2, 2, 2)), np.eye(4))
