@@ -62,7 +62,7 @@ class _Block(NamedTuple):
     """Every `step`-th voxel of a block less their mean, and the sum of their squares."""
 
     values: Array
-    squares: float
+    squares: np.float32
     step: int
 
 
