@@ -1,45 +1,56 @@
-"""Registration of a lung that slides along its wall: led by places inside it, masked from what lies around.
+"""Registration of a lung that slides along its wall: led by keypoints inside it, masked from what lies around.
 
-Ref: Wu 2008; Alvarez 2021, section 6.1.4 (the masked images); Polzin 2013 (places found again before the images).
+Ref: Wu 2008; Alvarez 2021, section 6.1.4 (the masked images); Polzin 2013 (keypoints before images).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from math import ceil, log2
 
 import numpy as np
 
-from registration.corrected import on_grid
+from registration.correspondences import Correspondences
 from registration.ffd import FfdFit, FfdSettings, Weights, register_ffd
-from registration.field import PointMap
-from registration.matching import MatchSettings, match_keypoints
-from registration.nearby import bounding_box, grown
-from registration.penalties import Keypoints
-from registration.resample import coarsen, resample, resample_mask
-from registration.rigid import RigidTransform
+from registration.images.morphology import bounding_box, dilate
+from registration.images.resample import coarsen, resample, resample_mask
+from registration.keypoints.matching import MatchSettings, match_keypoints
+from registration.maps.composite import dense_field
+from registration.maps.field import PointMap
+from registration.maps.rigid import RigidTransform
 from registration.volume import Cut, Mask, Volume
 
 OUTSIDE_HU = -1100.0
 BEYOND_MM = 5.0
 LEADING_MM = 32.0
-"""Finest control spacing that places lead alone; the finer levels, and this one once more, correct the first map."""
+"""Finest control spacing that keypoints lead alone; the finer levels, and this one once more, correct the first map."""
 SOFTER = 1 / 3
-"""Share of the bending weight that these keep where many places are found: what they correct is small then."""
+"""Share of the bending weight that these keep where many keypoints are matched: what they correct is small then."""
 AROUND_MM = 20.0
-"""What is kept around the lungs: more than they grow by, and more than voxels are blurred by."""
+"""What is kept around the lungs: more than they are dilated by, and more than voxels are blurred by."""
 FAR_MM, NEAR_MM = 24.0, 8.0
-"""How far along each axis places are looked for about the prior, and about the first map."""
-ROUGHLY = 0.3
+"""How far along each axis keypoints are looked for about the prior, and about the first map."""
+RESIDUAL = 0.3
 """Relative residual to which their steps are solved: closer takes longer and ends no nearer."""
 HOLD = 0.5
-"""Share of their weight that places keep at the finest levels, where images are nearer than half a voxel."""
+"""Share of their weight that keypoints keep at the finest levels, where images are nearer than half a voxel."""
 ENOUGH = 900
-"""Fewer places hold less: the errors of each weigh more in their mean."""
-LEAST_PAIRS = 20
-"""Fewer pairs than this may all be chance."""
+"""Fewer matches hold less: the errors of each weigh more in their mean."""
+LEAST_MATCHES = 20
+"""Fewer matches than this may all be chance."""
+
+
+@dataclass(frozen=True)
+class SlidingFit(FfdFit):
+    """A free-form deformation, and how it began. matched: keypoints matched about the prior, 0 for too few; moved_mm:
+    how far 95 % of them moved against it, infinite for too few; coarse: whether the coarse levels ran.
+    """
+
+    matched: int
+    moved_mm: float
+    coarse: bool
 
 
 def register_sliding(
@@ -48,31 +59,28 @@ def register_sliding(
     moving_lung: Mask,
     settings: FfdSettings,
     *,
-    fixed_lung: Mask | None = None,
+    fixed_lung: Mask,
     seen: Mask | None = None,
     prior: PointMap | None = None,
-    is_far: Callable[[Keypoints | None], bool] | None = None,
+    coarse_beyond_mm: float = -1.0,
     progress: Callable[[str, float], None] | None = None,
-) -> FfdFit:
+) -> SlidingFit:
     """Free-form deformation of a lung alone, whatever its wall does.
 
-    fixed_lung: the lung in the fixed image; without it, a first registration with the metric inside the moving lung
-    (placed by `prior`) carries the moving lung over. seen: field of view of the fixed image. Both images are set to
-    -1100 HU outside their lungs and compared inside the fixed lung grown by 5 mm, so the wall is met and nothing
-    outside can pull. A smooth wall looks alike wherever it has slid to, and vessels look alike when the map starts far
-    off, so places inside the lung are found first, up to 24 mm off the prior, and lead the coarse levels, down to a
-    control spacing of 32 mm; found again under that map, they hold the finest, and where there are many these bend more
-    easily. is_far: told the places found about the prior, says whether the coarse levels are needed (default always);
-    without them those places hold the finest.
+    seen: field of view of the fixed image. Both images are set to -1100 HU outside their lungs and compared inside the
+    fixed lung dilated by 5 mm, so the wall is met and nothing outside can pull. A smooth wall looks alike wherever it
+    has slid to, and vessels look alike when the map starts far off, so keypoints inside the lung are matched first, up
+    to 24 mm off the prior, and lead the coarse levels, down to a control spacing of 32 mm; matched again under that
+    map, they hold the finest, and where there are many these bend more easily. coarse_beyond_mm: the coarse levels are
+    left out where 95 % of the keypoints moved by no more than that against the prior; those matches then hold the
+    finest.
     """
-    if fixed_lung is None:
-        fixed_lung = _carried(fixed, moving, moving_lung, settings, seen, prior)
     cut = _around(fixed_lung, AROUND_MM)
     fixed, fixed_lung = fixed.part(cut), fixed_lung.part(cut)
     seen = Mask(np.ones_like(fixed_lung.inside), fixed_lung.ras_from_ijk) if seen is None else seen.part(cut)
     cut = _around(moving_lung, AROUND_MM)
     moving, moving_lung = moving.part(cut), moving_lung.part(cut)
-    region = Mask(grown(fixed_lung, BEYOND_MM).inside & seen.inside, fixed.ras_from_ijk)
+    region = Mask(dilate(fixed_lung.inside, BEYOND_MM, fixed_lung.grid.spacing) & seen.inside, fixed.ras_from_ijk)
     inner = Mask(fixed_lung.inside & seen.inside, fixed.ras_from_ijk)
     images = masked(fixed, fixed_lung), masked(moving, moving_lung)
     start = prior or RigidTransform.identity()
@@ -84,26 +92,38 @@ def register_sliding(
         levels=max(settings.levels - finer, 1),
     )
     voxel = settings.voxel_mm
-    found = partial(_found_again, coarsen(fixed, voxel), coarsen(moving, voxel), inner, moving_lung, voxel)
+    match = partial(_match, coarsen(fixed, voxel), coarsen(moving, voxel), inner, moving_lung, voxel)
     register = partial(register_ffd, *images, fixed_mask=region, progress=progress)
-    first, holding = start, found(start, FAR_MM)
-    if is_far is None or is_far(holding):
-        first = register(settings=coarse, prior=start, keypoints=holding).moving_from_fixed
-        holding = found(first, NEAR_MM)
-    held = finest_weights(settings.weights, 0 if holding is None else len(holding.fixed))
-    finest = replace(settings, levels=min(settings.levels, finer + 1), weights=held, residual=ROUGHLY)
-    return register(settings=finest, prior=first, keypoints=holding)
+    first, matches = start, match(start, FAR_MM)
+    matched, moved = 0 if matches is None else len(matches), moved_mm(matches, start)
+    is_far = moved > coarse_beyond_mm
+    if is_far:
+        first = register(settings=coarse, prior=start, matches=matches).moving_from_fixed
+        matches = match(first, NEAR_MM)
+    weights = finest_weights(settings.weights, 0 if matches is None else len(matches))
+    finest = replace(settings, levels=min(settings.levels, finer + 1), weights=weights, residual=RESIDUAL)
+    fit = register(settings=finest, prior=first, matches=matches)
+    found = {f.name: getattr(fit, f.name) for f in fields(fit)}
+    return SlidingFit(**found, matched=matched, moved_mm=moved, coarse=is_far)
 
 
-def finest_weights(weights: Weights, places: int) -> Weights:
-    """Weights of the finest levels: the more places were found, up to `ENOUGH`, the more they hold and the less bending
-    costs."""
-    detail = min(places / ENOUGH, 1.0)
+def finest_weights(weights: Weights, matches: int) -> Weights:
+    """Weights of the finest levels: the more keypoints were matched, up to `ENOUGH`, the more they hold and the less
+    bending costs.
+    """
+    detail = min(matches / ENOUGH, 1.0)
     bending = (1 - detail + detail * SOFTER) * weights.bending
     return replace(weights, bending=bending, keypoints=HOLD * detail * weights.keypoints)
 
 
-def _found_again(
+def moved_mm(matches: Correspondences | None, prior: PointMap) -> float:
+    """How far 95 % of the matches moved by at most against a prior map, mm; infinite without matches."""
+    if matches is None:
+        return float("inf")
+    return float(np.percentile(np.linalg.norm(matches.moving - prior(matches.fixed), axis=1), 95))
+
+
+def _match(
     fixed: Volume,
     moving: Volume,
     fixed_lung: Mask,
@@ -111,19 +131,17 @@ def _found_again(
     voxel_mm: float,
     prior: PointMap,
     reach_mm: float,
-) -> Keypoints | None:
-    """Places inside both lungs that both images show, at most `reach_mm` from where `prior` puts them; None for too
-    few.
-    """
-    dense = on_grid(prior, fixed.grid)
-    pairs = match_keypoints(
-        resample(moving, fixed.grid, dense),
+) -> Correspondences | None:
+    """Keypoints inside both lungs, matched at most `reach_mm` from where `prior` puts them; None for too few."""
+    dense = dense_field(prior, fixed.grid)
+    matches = match_keypoints(
         fixed,
+        resample(moving, fixed.grid, dense),
         resample_mask(fixed_lung, fixed.grid),
         MatchSettings(voxel_mm=voxel_mm, reach_mm=reach_mm),
-        first_region=resample_mask(moving_lung, fixed.grid, dense),
+        moving_region=resample_mask(moving_lung, fixed.grid, dense),
     )
-    return None if len(pairs) < LEAST_PAIRS else Keypoints(pairs.second, prior(pairs.first), np.ones(len(pairs)))
+    return None if len(matches) < LEAST_MATCHES else matches.mapped(moving=prior)
 
 
 def masked(volume: Volume, lung: Mask) -> Volume:
@@ -132,20 +150,6 @@ def masked(volume: Volume, lung: Mask) -> Volume:
         raise ValueError(f"the lung mask must lie on the image's grid: {lung!r} against {volume!r}; resample it first")
     hu = np.where(lung.inside, np.maximum(volume.hu, np.float32(-1000)), np.float32(OUTSIDE_HU))
     return Volume(hu.astype(np.float32), volume.ras_from_ijk)
-
-
-def _carried(
-    fixed: Volume,
-    moving: Volume,
-    moving_lung: Mask,
-    settings: FfdSettings,
-    seen: Mask | None,
-    prior: PointMap | None,
-) -> Mask:
-    placed = resample_mask(moving_lung, fixed.grid, prior)
-    region = placed if seen is None else Mask(placed.inside & seen.inside, placed.ras_from_ijk)
-    first = register_ffd(fixed, moving, settings, fixed_mask=region, prior=prior)
-    return resample_mask(moving_lung, fixed.grid, first.moving_from_fixed)
 
 
 def _around(lung: Mask, margin_mm: float) -> Cut:

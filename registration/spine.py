@@ -13,11 +13,12 @@ from numba import njit, prange
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
-from registration.interpolate import interpolate, warp_samples
-from registration.metric import GlobalNcc
-from registration.pyramid import Pyramid
-from registration.resample import coarsen, coarsen_mask
-from registration.rigid import RigidTransform
+from registration.images.interpolate import interpolate, warp_samples
+from registration.images.pyramid import Pyramid
+from registration.images.resample import coarsen, coarsen_mask
+from registration.kernels.correlation import coefficient
+from registration.maps.rigid import RigidTransform
+from registration.terms.metrics import GlobalNcc
 from registration.volume import Array, Mask, Volume
 
 BONE_WINDOW = (-150.0, 700.0)
@@ -59,7 +60,7 @@ class SpineSearch:
 
 
 @dataclass(frozen=True)
-class _Pair:
+class _Level:
     """Samples of the fixed image, the moving image and where that sees, at one resolution."""
 
     points: Array
@@ -91,15 +92,15 @@ def register_spine(
     if not fixed_spine.inside.any():
         raise ValueError("the fixed spine mask is empty; check its segmentation")
     centre = fixed_spine.grid.to_ras(np.argwhere(fixed_spine.inside).mean(axis=0))
-    coarse, middle, fine = _pairs(fixed, moving, fixed_spine, fixed_seen, moving_seen, search.surroundings_mm)
+    coarse, middle, fine = _levels(fixed, moving, fixed_spine, fixed_seen, moving_seen, search.surroundings_mm)
     poses = _coarse(coarse, centre, initial, search, moving_spine)
-    best = _climbed(poses, (middle, fine), centre, 4)
+    best = _refined(poses, (middle, fine), centre, 4)
     if not best:
         return RigidFit(initial, RigidStatus.POOR, -1.0, -1.0, 0.0, 0.0)
     pose, ncc = best[0]
     axis = _spine_axis(fixed_spine)
     slips = [pose @ _shift(s * axis) for s in (-42.0, -30.0, -20.0, 20.0, 30.0, 42.0)]
-    others = [item for item in best[1:] + _climbed(slips, (middle, fine), centre, 3) if _far(item[0], pose, centre)]
+    others = [item for item in best[1:] + _refined(slips, (middle, fine), centre, 3) if _far(item[0], pose, centre)]
     second, second_ncc = max(others, key=lambda item: item[1], default=(pose, -1.0))
     status = RigidStatus.FOUND
     if ncc < search.least_ncc:
@@ -110,15 +111,15 @@ def register_spine(
     return RigidFit(pose, status, ncc, second_ncc, _distance(second, pose, centre), overlap)
 
 
-def _pairs(
+def _levels(
     fixed: Volume,
     moving: Volume,
     spine: Mask,
     fixed_seen: Mask | None,
     moving_seen: Mask | None,
     surroundings_mm: float,
-) -> list[_Pair]:
-    """Pairs at 8, 4 and 2 mm, each coarsened from the finer one, with samples around the spine that the image shows."""
+) -> list[_Level]:
+    """Levels of 8, 4 and 2 mm, each coarsened from the finer, with samples around the spine that the image shows."""
     everywhere = Mask(np.ones(moving.hu.shape, dtype=bool), moving.ras_from_ijk)
     seen = coarsen_mask(moving_seen or everywhere, 2.0)
     images = Pyramid(fixed, spine, moving, moving_seen, 2.0).at(2.0)
@@ -127,7 +128,7 @@ def _pairs(
     shown = None if fixed_seen is None else coarsen_mask(fixed_seen, 2.0)
     inside = coarsen(coarsen_mask(spine, 2.0), 4.0)
     away = ndimage.distance_transform_edt(inside.hu < 0.1, sampling=inside.grid.spacing)
-    pairs = []
+    levels = []
     for voxel, most in ((2.0, 12000), (4.0, 4000), (8.0, 600)):
         fixed, moving, seen = (coarsen(v, voxel) for v in (fixed, moving, seen))
         points = fixed.grid.points().reshape(-1, 3)
@@ -142,24 +143,24 @@ def _pairs(
         index = index[np.random.default_rng(0).permutation(len(index))[:most]]
         values = np.clip(fixed.hu.reshape(-1)[index], low, high)
         clipped = Volume(np.clip(moving.hu, low, high), moving.ras_from_ijk)
-        pairs.append(_Pair(points[index], values, clipped, seen))
-    return pairs[::-1]
+        levels.append(_Level(points[index], values, clipped, seen))
+    return levels[::-1]
 
 
-def _climbed(
-    starts: list[RigidTransform], pairs: tuple[_Pair, _Pair], centre: Array, most: int
+def _refined(
+    starts: list[RigidTransform], levels: tuple[_Level, _Level], centre: Array, most: int
 ) -> list[tuple[RigidTransform, float]]:
     """Distinct poses refined at both resolutions with their correlations, best first."""
-    fits = sorted((_refine(pairs[0], pose, centre, 12) for pose in starts), key=lambda item: -item[1])
+    fits = sorted((_refine(levels[0], pose, centre, 12) for pose in starts), key=lambda item: -item[1])
     apart: list[tuple[RigidTransform, float]] = []
     for pose, ncc in fits:
         if ncc > -1 and len(apart) < most and all(_far(pose, k, centre) for k, _ in apart):
             apart.append((pose, ncc))
-    return sorted((_refine(pairs[1], pose, centre, 8) for pose, _ in apart), key=lambda item: -item[1])
+    return sorted((_refine(levels[1], pose, centre, 8) for pose, _ in apart), key=lambda item: -item[1])
 
 
 def _coarse(
-    pair: _Pair, centre: Array, initial: RigidTransform, search: SpineSearch, moving_spine: Mask | None
+    level: _Level, centre: Array, initial: RigidTransform, search: SpineSearch, moving_spine: Mask | None
 ) -> list[RigidTransform]:
     """Best distinct poses of the search grid at the coarsest resolution."""
     step = 10.0
@@ -168,19 +169,19 @@ def _coarse(
     shifts = shifts[np.linalg.norm(shifts, axis=1) <= search.shift_mm + 1e-6]
     if moving_spine is not None:
         shifts = shifts[_near_spine(moving_spine, initial(centre[None])[0] + shifts)]
-    turns = _turns(search.angle_degrees)
-    ijk = pair.moving.grid.ijk_from_ras
-    relative = pair.points - centre
-    base = np.stack([relative @ (ijk[:3, :3] @ initial.matrix[:3, :3] @ r).T for r in turns])
-    target = pair.moving.grid.to_ijk(initial(centre[None])[0] + shifts)
-    scores = np.empty((len(turns), len(shifts)), dtype=np.float32)
-    unseen = np.where(pair.seen.hu > 0.9, pair.moving.hu, np.float32(2 * UNSEEN))
-    _scores(np.ascontiguousarray(unseen), base.astype(np.float32), target.astype(np.float32), pair.values, scores)
+    rotations = _rotations(search.angle_degrees)
+    ijk = level.moving.grid.ijk_from_ras
+    relative = level.points - centre
+    base = np.stack([relative @ (ijk[:3, :3] @ initial.matrix[:3, :3] @ r).T for r in rotations])
+    target = level.moving.grid.to_ijk(initial(centre[None])[0] + shifts)
+    scores = np.empty((len(rotations), len(shifts)), dtype=np.float32)
+    unseen = np.where(level.seen.hu > 0.9, level.moving.hu, np.float32(2 * UNSEEN))
+    _scores(np.ascontiguousarray(unseen), base.astype(np.float32), target.astype(np.float32), level.values, scores)
     kept: list[RigidTransform] = []
     for flat in np.argsort(-scores, axis=None)[:4000]:
         t, s = np.unravel_index(flat, scores.shape)
         m = np.eye(4)
-        m[:3, :3] = initial.matrix[:3, :3] @ turns[t]
+        m[:3, :3] = initial.matrix[:3, :3] @ rotations[t]
         m[:3, 3] = initial(centre[None])[0] + shifts[s] - m[:3, :3] @ centre
         pose = RigidTransform(m)
         if scores[t, s] > 0 and all(
@@ -192,7 +193,7 @@ def _coarse(
     return kept
 
 
-def _turns(half_width: float) -> list[Array]:
+def _rotations(half_width: float) -> list[Array]:
     """Rotations on a grid of rotation vectors, about 12 degrees apart, up to `half_width` degrees."""
     n = max(int(np.ceil(half_width / 13)), 1)
     ticks = np.linspace(-half_width, half_width, 2 * n + 1) * 0.9
@@ -210,9 +211,9 @@ def _near_spine(spine: Mask, points: Array, reach_mm: float = 30.0) -> Array:
 @njit(cache=True, parallel=True, fastmath=True)
 def _scores(voxels, base, target, values, scores):
     ni, nj, nk = voxels.shape
-    turns, n, _ = base.shape
+    rotations, n, _ = base.shape
     for s in prange(target.shape[0]):
-        for t in range(turns):
+        for t in range(rotations):
             count, sf, sm, sff, smm, sfm = 0, 0.0, 0.0, 0.0, 0.0, 0.0
             for p in range(n):
                 x, y, z = base[t, p, 0] + target[s, 0], base[t, p, 1] + target[s, 1], base[t, p, 2] + target[s, 2]
@@ -227,21 +228,19 @@ def _scores(voxels, base, target, values, scores):
                 sff, smm, sfm = sff + f * f, smm + m * m, sfm + f * m
             scores[t, s] = -1.0
             if count >= 0.6 * n:
-                vf, vm = sff - sf * sf / count, smm - sm * sm / count
-                if vf > 0 and vm > 0:
-                    scores[t, s] = (sfm - sf * sm / count) / np.sqrt(vf * vm)
+                scores[t, s] = coefficient(count, sf, sm, sff, smm, sfm, 0.0, 0.0)
 
 
-def _refine(pair: _Pair, pose: RigidTransform, centre: Array, steps: int) -> tuple[RigidTransform, float]:
+def _refine(level: _Level, pose: RigidTransform, centre: Array, steps: int) -> tuple[RigidTransform, float]:
     """Gauss-Newton on rotation about `centre` and shift, damped until each step raises the correlation."""
-    metric = GlobalNcc(pair.values)
-    a = np.ascontiguousarray(pair.moving.grid.ijk_from_ras[:3, :3])
-    still, index = np.zeros((3, 1)), np.zeros(len(pair.points), dtype=np.int64)
+    metric = GlobalNcc(level.values)
+    a = np.ascontiguousarray(level.moving.grid.ijk_from_ras[:3, :3])
+    still, index = np.zeros((3, 1)), np.zeros(len(level.points), dtype=np.int64)
 
     def sampled(p: RigidTransform) -> tuple[Array, Array, Array, Array]:
-        moved = p(pair.points)
-        base = np.ascontiguousarray(pair.moving.grid.to_ijk(moved))
-        return moved, _weights(pair, moved), *warp_samples(pair.moving.hu, base, still, index, a)
+        moved = p(level.points)
+        base = np.ascontiguousarray(level.moving.grid.to_ijk(moved))
+        return moved, _weights(level, moved), *warp_samples(level.moving.hu, base, still, index, a)
 
     moved, w, m, g = sampled(pose)
     if w.mean() < LEAST_OVERLAP:
@@ -276,9 +275,9 @@ def _far(a: RigidTransform, b: RigidTransform, centre: Array) -> bool:
     return _distance(a, b, centre) > 8.0
 
 
-def _weights(pair: _Pair, moved: Array) -> Array:
+def _weights(level: _Level, moved: Array) -> Array:
     """1 for samples (n,) that land where the moving image sees, else 0."""
-    return (interpolate(pair.seen.hu, pair.seen.grid, moved, 0.0) > 0.9).astype(float)
+    return (interpolate(level.seen.hu, level.seen.grid, moved, 0.0) > 0.9).astype(float)
 
 
 def _spine_axis(spine: Mask) -> Array:

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from scipy import ndimage
 
-from registration.resample import resample_mask
+from registration.images.resample import resample_mask
 from registration.volume import Array, Grid, Mask, Volume, axis_codes
 from vatsloc.errors import CaseError, InputRefused
 from vatsloc.formats.casefile import CaseFile, PleuralGas, Side, Triple, read_case_file

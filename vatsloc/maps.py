@@ -8,8 +8,8 @@ import numpy as np
 from scipy import ndimage
 
 from poro.mesh import TetMesh, interpolate, locate
-from registration.field import DisplacementField, sample_map
-from registration.rigid import RigidTransform
+from registration.maps.field import DisplacementField, sample_map
+from registration.maps.rigid import RigidTransform
 from registration.volume import Array, Grid, Mask
 
 

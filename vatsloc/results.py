@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from registration.field import DisplacementField
+from registration.maps.field import DisplacementField
 from registration.volume import Array, Mask, Volume
 from vatsloc.formats.fields import write_field
 from vatsloc.formats.folder import PROGRAM, RUN_FILE

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from registration.bending import BendingEnergy
-from registration.bspline import BSplineField, Lattice, basis_rows, control_grid
+from registration.maps.bspline import BSplineField, Lattice, basis_rows, control_grid
+from registration.terms.bending import BendingEnergy
 from registration.volume import Array, Grid
 from tests.registration.scenes import oriented
 

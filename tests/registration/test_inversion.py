@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from registration.bspline import BSplineField, control_grid
-from registration.field import DisplacementField, compose, sample_map
-from registration.inversion import inverse_residual, invert_at, invert_field
-from registration.rigid import RigidTransform
+from registration.maps.bspline import BSplineField, control_grid
+from registration.maps.field import DisplacementField, compose, sample_map
+from registration.maps.inversion import inverse_residual, invert_at, invert_field
+from registration.maps.rigid import RigidTransform
 from registration.volume import Array, Grid
 from tests.registration.scenes import oriented
 

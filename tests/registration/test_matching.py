@@ -1,11 +1,11 @@
-"""Matched points: found where the image is distinctive, by value and sign; refused where they cannot be believed."""
+"""Keypoints: matched where the image is distinctive, by value and sign; refused where they cannot be believed."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from registration.matching import MatchSettings, alike, distinctiveness, match_keypoints
+from registration.keypoints.matching import MatchSettings, distinctiveness, match_keypoints, moves_with_neighbours
 from registration.volume import Mask, Volume
 from tests.registration.scenes import image_of, make_pattern, oriented
 
@@ -15,32 +15,32 @@ PATTERN = make_pattern(seed=3)
 
 
 @pytest.mark.parametrize("shift_ras", [(5.0, -3.0, 2.0), (-9.0, 4.0, 7.0)])
-def test_a_shifted_image_gives_pairs_that_differ_by_the_shift(shift_ras: tuple[float, float, float]) -> None:
+def test_a_shifted_image_gives_matches_that_differ_by_the_shift(shift_ras: tuple[float, float, float]) -> None:
     shift = np.array(shift_ras)
-    second = image_of(PATTERN, GRID)
-    first = image_of(lambda points: PATTERN(points - shift), GRID)
-    pairs = match_keypoints(first, second, EVERYWHERE)
-    assert len(pairs) > 40
-    error = np.linalg.norm(pairs.first - pairs.second - shift, axis=1)
+    fixed = image_of(PATTERN, GRID)
+    moving = image_of(lambda points: PATTERN(points - shift), GRID)
+    matches = match_keypoints(fixed, moving, EVERYWHERE)
+    assert len(matches) > 40
+    error = np.linalg.norm(matches.moving - matches.fixed - shift, axis=1)
     assert np.median(error) < 0.5  # a quarter of a voxel
     assert error.max() < 2.0
 
 
 def test_brightness_and_contrast_do_not_matter() -> None:
-    second = image_of(PATTERN, GRID)
-    first = image_of(lambda points: 300 + 0.4 * PATTERN(points - np.array([4.0, 0.0, -4.0])), GRID)
-    pairs = match_keypoints(first, second, EVERYWHERE)
-    assert np.median(np.abs(pairs.first - pairs.second - [4.0, 0.0, -4.0])) < 0.4
+    fixed = image_of(PATTERN, GRID)
+    moving = image_of(lambda points: 300 + 0.4 * PATTERN(points - np.array([4.0, 0.0, -4.0])), GRID)
+    matches = match_keypoints(fixed, moving, EVERYWHERE)
+    assert np.median(np.abs(matches.moving - matches.fixed - [4.0, 0.0, -4.0])) < 0.4
 
 
 def test_points_come_from_the_region_and_from_where_the_other_image_is_believed() -> None:
-    second = image_of(PATTERN, GRID)
+    fixed = image_of(PATTERN, GRID)
     half = GRID.points()[..., 2] > 30.0
     region = Mask(half, GRID.ras_from_ijk)
-    pairs = match_keypoints(second, second, EVERYWHERE, first_region=region)
-    assert pairs.first[:, 2].min() > 28.0
-    pairs = match_keypoints(second, second, region)
-    assert pairs.second[:, 2].min() > 29.0
+    matches = match_keypoints(fixed, fixed, EVERYWHERE, moving_region=region)
+    assert matches.moving[:, 2].min() > 28.0
+    matches = match_keypoints(fixed, fixed, region)
+    assert matches.fixed[:, 2].min() > 29.0
 
 
 def test_noise_without_anything_in_common_is_refused() -> None:
@@ -55,9 +55,9 @@ def test_a_flat_image_has_no_points() -> None:
 
 
 def test_a_motion_beyond_the_reach_is_not_mistaken_for_a_smaller_one() -> None:
-    second = image_of(PATTERN, GRID)
-    first = image_of(lambda points: PATTERN(points - np.array([20.0, 0.0, 0.0])), GRID)
-    assert len(match_keypoints(first, second, EVERYWHERE, MatchSettings(reach_mm=8.0))) < 4
+    fixed = image_of(PATTERN, GRID)
+    moving = image_of(lambda points: PATTERN(points - np.array([20.0, 0.0, 0.0])), GRID)
+    assert len(match_keypoints(fixed, moving, EVERYWHERE, MatchSettings(reach_mm=8.0))) < 4
 
 
 def test_a_corner_is_distinctive_and_an_edge_is_not() -> None:
@@ -71,4 +71,4 @@ def test_one_that_moves_against_its_neighbours_is_dropped() -> None:
     points = np.random.default_rng(1).uniform(0, 50, (60, 3))
     motion = 0.1 * points
     motion[7] += [9.0, 0.0, 0.0]
-    assert np.flatnonzero(~alike(points, motion, 10, 5.0)).tolist() == [7]
+    assert np.flatnonzero(~moves_with_neighbours(points, motion, 10, 5.0)).tolist() == [7]

@@ -7,9 +7,9 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from registration.field import DisplacementField, sample_map
-from registration.resample import coarsen, resample, resample_mask, smooth
-from registration.rigid import RigidTransform
+from registration.images.resample import coarsen, resample, resample_mask, smooth
+from registration.maps.field import DisplacementField, sample_map
+from registration.maps.rigid import RigidTransform
 from registration.volume import Array, Grid, Mask, Volume
 from tests.registration.scenes import image_of, make_pattern, oriented, tilted
 
@@ -83,6 +83,14 @@ def test_coarsening_and_smoothing_keep_linear_scenes_and_damp_waves_as_a_gaussia
     wave = image_of(lambda p: 100 * np.cos(2 * np.pi * p[:, 2] / 12), grid)
     damped = smooth(wave, 2.0).hu[:, :, 10:-10]
     assert_allclose(damped, wave.hu[:, :, 10:-10] * np.exp(-2 * (np.pi * 2 / 12) ** 2), atol=0.5)
+
+
+def test_a_displacement_field_of_one_slice_is_linear_along_the_others() -> None:
+    vectors = np.zeros((2, 3, 1, 3))
+    vectors[1, :, 0, 1] = 4.0
+    field = DisplacementField(vectors, np.diag([2.0, 2.0, 5.0, 1.0]))
+    points = np.array([[0.5, 1.0, 0.0], [1.5, 3.0, 2.0], [9.0, 0.0, -7.0]])
+    assert_allclose(field.displacement(points), [[0, 1, 0], [0, 3, 0], [0, 4, 0]], atol=1e-12)
 
 
 def test_a_displacement_field_refuses_scalars() -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from registration.rigid import RigidTransform
+from registration.maps.rigid import RigidTransform
 from registration.spine import RigidStatus, SpineSearch, register_spine
 from registration.volume import Array, Grid, Mask, Volume
 from tests.registration.scenes import oriented

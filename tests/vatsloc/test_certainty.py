@@ -12,8 +12,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 from poro.mesh import TetMesh, stuff
-from registration.matching import Pairs
-from registration.rigid import RigidTransform
+from registration.correspondences import Correspondences
+from registration.maps.rigid import RigidTransform
 from vatsloc.workflow.certainty import MODEL_ALONE_MM, covariance, place_sigma_mm, radius95, scatter
 
 QUANTILE = np.sqrt(7.814728)  # of chi-squared with three degrees of freedom, 95 %
@@ -40,7 +40,7 @@ class Scene:
         along_x = np.zeros((n, 3, 1))
         along_x[:, 0] = 1.0
         fit = SimpleNamespace(sensitivity=along_x, covariance=np.array([[4.0]]), surface_rms_mm=9, keypoint_rms_mm=9)
-        pairs = () if self.places is None else Pairs(self.places + self.missed, self.places, np.ones(len(self.places)))
+        pairs = () if self.places is None else Correspondences.of(self.places, self.places + self.missed)
         model = SimpleNamespace(others=self.others, pairs=pairs, rungs=() if self.places is None else ("tried",))
         corrected = SimpleNamespace(seen=self.seen, disagreement_mm=self.disagreement_mm)
         return SimpleNamespace(

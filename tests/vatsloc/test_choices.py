@@ -10,12 +10,17 @@ import pytest
 
 from phantoms.cbct import Scanner
 from phantoms.spec import SPECS, Collapse, Lesion, PhantomSpec
-from registration.penalties import Keypoints
+from registration.correspondences import Correspondences
+from registration.maps.bspline import BSplineField
+from registration.maps.composite import CompositeTransform
+from registration.maps.rigid import RigidTransform
+from registration.sliding import SlidingFit, moved_mm
+from registration.terms.gauss_newton import Stop
 from vatsloc.phantom_case import write_phantom
 from vatsloc.study.choices import LIMITS, Tried, table, try_choices
 from vatsloc.workflow.choices import Choice, weigh
 from vatsloc.workflow.pneumothorax import RESIDUAL
-from vatsloc.workflow.pose import FIRST, extrapolated, is_far
+from vatsloc.workflow.pose import FIRST, extrapolated, moved_far
 from vatsloc.workflow.stages import Stages
 
 SMALL = PhantomSpec("small", "right", ct_spacing=(2.0, 2.0, 2.0), cbct_spacing=(2.0, 2.0, 2.0), element=22.0)
@@ -66,12 +71,20 @@ def test_places_that_moved_little_against_the_spine_make_the_first_registration_
     spine = lambda x: x + np.array([100.0, 0, 0])  # noqa: E731
     moved = spine(fixed) + np.array([0.0, 3, 4])
     moved[:3] += 40  # 95 % count
-    stages = Stages()
-    places = Keypoints(fixed, moved, np.ones(100))
-    assert not is_far(spine, 5.1, stages, places)
-    assert is_far(spine, 4.9, stages, places)
-    assert is_far(spine, 100.0, stages, None)
-    assert [round(choice.value, 6) for choice in stages.choices] == [5, 5, inf]
+    matched = sliding_fit(100, moved_mm(Correspondences.of(fixed, moved), spine))
+    assert not moved_far(matched, 5.1).kept
+    assert moved_far(matched, 4.9).kept
+    assert moved_far(matched, 5.1).value == pytest.approx(5)
+    assert moved_far(matched, 5.1).why.startswith("95 % of 100 places inside the lung moved by at most 5.0 mm")
+    none = sliding_fit(0, moved_mm(None, spine))
+    assert moved_far(none, 100.0).kept
+    assert moved_far(none, 100.0).value == inf
+
+
+def sliding_fit(matched: int, moved: float) -> SlidingFit:
+    """A fit of which only what it began with counts."""
+    still = CompositeTransform(RigidTransform.identity(), BSplineField(np.zeros((4, 4, 4, 3)), np.eye(4)))
+    return SlidingFit(still, Stop.CONVERGED, (), 1.0, 0.0, 1.0, matched, moved, True)
 
 
 def test_extrapolation_goes_where_no_node_is_out_of_view() -> None:

@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from poro.mesh import TetMesh
-from registration.field import DisplacementField
+from registration.maps.field import DisplacementField
 from registration.volume import Mask
 from vatsloc.errors import CaseError
 from vatsloc.evaluation.ellipsoid import in_ellipsoid

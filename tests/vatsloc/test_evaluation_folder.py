@@ -11,8 +11,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 from poro.mesh import stuff
-from registration.field import sample_map
-from registration.rigid import RigidTransform
+from registration.maps.field import sample_map
+from registration.maps.rigid import RigidTransform
 from registration.volume import Grid, Mask, Volume
 from vatsloc.case import sha256
 from vatsloc.errors import CaseError, InputRefused

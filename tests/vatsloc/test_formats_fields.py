@@ -8,7 +8,7 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from registration.field import DisplacementField
+from registration.maps.field import DisplacementField
 from vatsloc.errors import InputRefused
 from vatsloc.formats.fields import STEP_MM, read_field, write_field
 

@@ -15,7 +15,7 @@ from poro.mesh import TetMesh, stuff
 from poro.model import Theta, assemble, solve
 from poro.observations import Target
 from poro.tissue import Tissue
-from registration.matching import Pairs
+from registration.correspondences import Correspondences
 from vatsloc.workflow.ladder import NO_OTHERS, Model, Step, best_of, corrected, held_back, misfit
 from vatsloc.workflow.spread import other_answers
 
@@ -53,11 +53,11 @@ def still(lung: TetMesh) -> Model:
     return Model(system, replace(found, state=replace(found.state, u=nothing)), nothing, _pairs(), (), solid, NO_OTHERS)
 
 
-def _pairs(noise_mm: float = 0.0, smooth: bool = True) -> Pairs:
+def _pairs(noise_mm: float = 0.0, smooth: bool = True) -> Correspondences:
     rng = np.random.default_rng(5)
     x = rng.uniform(-45, 45, (300, 3))
     motion = x @ GRADIENT.T if smooth else 0 * x
-    return Pairs(x, x + motion + noise_mm * rng.normal(size=x.shape), np.ones(300))
+    return Correspondences.of(x + motion + noise_mm * rng.normal(size=x.shape), x)
 
 
 def _steps() -> dict[str, Step]:
@@ -68,7 +68,7 @@ def test_misfit_is_the_median_distance(lung: TetMesh) -> None:
     shift = np.array([2.0, -1.0, 2.0])
     x = np.array([[0.0, 0, 0], [10, 5, 0], [-20, 3, 7]])
     y = x + shift + np.array([[0.0, 0, 0], [0, 4, 0], [0, 0, 30]])
-    assert misfit(lung, np.broadcast_to(shift, lung.points.shape), Pairs(x, y, np.ones(3))) == pytest.approx(4.0)
+    assert misfit(lung, np.broadcast_to(shift, lung.points.shape), Correspondences.of(y, x)) == pytest.approx(4.0)
 
 
 def test_a_quarter_is_held_back_in_whole_blocks() -> None:
@@ -89,11 +89,11 @@ def test_a_rung_that_predicts_what_it_has_not_seen_is_taken_and_follows_all_pair
     best = min(model.rungs, key=lambda rung: rung.after_mm)
     assert best.kept
     assert best.before_mm == pytest.approx(
-        np.median(np.linalg.norm(_pairs().first @ GRADIENT.T, axis=1)[held_back(_pairs().second)])
+        np.median(np.linalg.norm(_pairs().moving @ GRADIENT.T, axis=1)[held_back(_pairs().fixed)])
     )
     assert model.held_back_mm == best.after_mm < 0.3 * best.before_mm
     mesh = still.system.mesh
-    hidden = held_back(_pairs().second)
+    hidden = held_back(_pairs().fixed)
     assert misfit(mesh, model.displacement, _pairs().only(hidden)) < misfit(
         mesh, blind.displacement, _pairs().only(hidden)
     )

@@ -16,7 +16,7 @@ import pytest
 
 from poro.mesh import TetMesh
 from poro.tissue import Tissue
-from registration.rigid import RigidTransform
+from registration.maps.rigid import RigidTransform
 from vatsloc.case import read_case
 from vatsloc.evaluation import evaluate_case
 from vatsloc.formats.fields import read_field

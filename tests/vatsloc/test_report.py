@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from registration.rigid import RigidTransform
+from registration.maps.rigid import RigidTransform
 from registration.volume import Mask, Volume
 from vatsloc.report.charts import LABEL, bars, box_plot
 from vatsloc.report.data import LUNG, NODULE, Comparison, Nodule, Outline, Picture, ReportData, TreSection

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from registration.rigid import RigidTransform
+from registration.maps.rigid import RigidTransform
 from registration.volume import Volume
 from tests.vatsloc.browser import CHROMIUM, asked_by_the_page, visit
 from vatsloc.formats.meshes import Surface

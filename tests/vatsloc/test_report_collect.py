@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from registration.field import DisplacementField
-from registration.rigid import RigidTransform
+from registration.maps.field import DisplacementField
+from registration.maps.rigid import RigidTransform
 from registration.volume import Mask, Volume
 from vatsloc.case import Case, Hints, Nodule
 from vatsloc.formats.meshes import Surface, TetraMesh

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from registration.rigid import RigidTransform
+from registration.maps.rigid import RigidTransform
 from registration.volume import Grid, Volume
 from vatsloc.formats.meshes import Surface
 from vatsloc.report.planes import AXES, box_of, ellipse, plane_through, sample, section

@@ -11,7 +11,7 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from registration.field import DisplacementField
+from registration.maps.field import DisplacementField
 from registration.volume import Mask, Volume, axis_codes
 from vatsloc.formats.folder import is_result, whole_folder
 from vatsloc.formats.meshes import Surface, TetraMesh

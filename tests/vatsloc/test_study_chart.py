@@ -17,8 +17,8 @@ import pytest
 from poro.fit import FitStatus
 from poro.mesh import TetMesh
 from registration.ffd import FfdSettings, Weights
-from registration.resample import resample
-from registration.rigid import RigidTransform
+from registration.images.resample import resample
+from registration.maps.rigid import RigidTransform
 from registration.volume import Mask, Volume
 from tests.vatsloc.browser import CHROMIUM, asked_by_the_page, visit
 from vatsloc.errors import CaseError, InputRefused

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from registration.field import DisplacementField
-from registration.interpolate import interpolate
-from registration.rigid import RigidTransform
+from registration.images.interpolate import interpolate
+from registration.maps.field import DisplacementField
+from registration.maps.rigid import RigidTransform
 from registration.volume import Mask, Volume
 from vatsloc.study import bench_registration as bench
 from vatsloc.study import stability_registration as stability

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from poro.mesh import TetMesh, stuff_level_set
-from registration.rigid import RigidTransform
+from registration.maps.rigid import RigidTransform
 from registration.volume import Grid, Mask
 from vatsloc.errors import CaseError, InputRefused
 from vatsloc.maps import MeshMap, covered, sampled

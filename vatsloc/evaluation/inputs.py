@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from poro.mesh import TetMesh, closest_points
-from registration.field import DisplacementField
-from registration.rigid import RigidTransform
+from registration.maps.field import DisplacementField
+from registration.maps.rigid import RigidTransform
 from registration.volume import Array, Mask
 from vatsloc.case import Landmarks, read_landmarks, sha256
 from vatsloc.errors import CaseError, InputRefused

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from registration.field import DisplacementField
+from registration.maps.field import DisplacementField
 from vatsloc.errors import InputRefused
 from vatsloc.formats.nifti import nifti_image, open_nifti, read_nifti, save_nifti
 from vatsloc.formats.raw import check_affine

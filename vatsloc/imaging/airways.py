@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
+from registration.images.morphology import bounding_box, dilate, touching
 from registration.volume import Array, Volume
-from vatsloc.imaging.lattice import bounding_box, dilate, touching
 
 TUBE_AREA_MM2 = (50.0, 900.0)
 MOST_AIRWAY_ML = 120.0

@@ -7,10 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
+from registration.images.morphology import bounding_box, dilate, erode, largest
 from registration.volume import Array, Mask
 from vatsloc.imaging.airways import TrackedAirways, track_airways
 from vatsloc.imaging.cbct import PreparedCbct
-from vatsloc.imaging.lattice import bounding_box, dilate, erode, largest, on_grid
+from vatsloc.imaging.lattice import on_grid
 from vatsloc.imaging.lungs import Side
 from vatsloc.imaging.thorax import working_scene
 

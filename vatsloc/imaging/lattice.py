@@ -1,19 +1,18 @@
-"""Coarse working copies of images, along the patient's axes, and morphology measured in millimetres."""
+"""Coarse working copies of images, along the patient's axes, and their masks on other grids."""
 
 from __future__ import annotations
 
 import numpy as np
 from scipy import ndimage
 
+from registration.images.morphology import bounding_box
 from registration.volume import Array, Grid, Mask, Volume
-
-TIE_MM = 1e-6
-"""Spacings of a turned grid are rounded; a distance equal to the radius has to stay equal."""
+from vatsloc.frames import reorient
 
 
 def working_copy(volume: Volume, spacing_mm: float) -> Volume:
     """Block means with axes turned to R, A, S and voxels about `spacing_mm` wide; a coarser axis stays."""
-    hu, affine = _turned(volume.hu, volume.ras_from_ijk)
+    hu, affine = reorient(volume.hu, volume.ras_from_ijk, "RAS")
     spacing = np.linalg.norm(affine[:3, :3], axis=0)
     block = np.clip(np.rint(spacing_mm / spacing).astype(int), 1, hu.shape)
     size = np.array(hu.shape) // block
@@ -27,25 +26,6 @@ def working_copy(volume: Volume, spacing_mm: float) -> Volume:
             for c in range(block[2]):
                 total += hu[a : ni : block[0], b : nj : block[1], c : nk : block[2]]
     return Volume(total / np.float32(block.prod()), affine)
-
-
-def _turned(values: Array, ras_from_ijk: Array) -> tuple[Array, Array]:
-    """The same voxels with the axis nearest to R first, then A, then S, each pointing that way."""
-    order, direction = [], ras_from_ijk[:3, :3] / np.linalg.norm(ras_from_ijk[:3, :3], axis=0)
-    left = [0, 1, 2]
-    for patient_axis in range(3):
-        best = max(left, key=lambda m: abs(direction[patient_axis, m]))
-        order.append(best)
-        left.remove(best)
-    affine = ras_from_ijk.copy()
-    affine[:3, :3] = ras_from_ijk[:3, order]
-    values = values.transpose(order)
-    for m in range(3):
-        if affine[m, m] < 0:
-            values = np.flip(values, m)
-            affine[:3, 3] += affine[:3, m] * (values.shape[m] - 1)
-            affine[:3, m] = -affine[:3, m]
-    return values, affine
 
 
 def on_grid(inside: Array, source: Grid, target: Grid, smooth_mm: float = 0.0) -> Mask:
@@ -75,55 +55,3 @@ def on_grid(inside: Array, source: Grid, target: Grid, smooth_mm: float = 0.0) -
         )
         out[tuple(slice(a, a + n) for a, n in zip(lo, part.shape, strict=True))] = value >= 0.5
     return Mask(out, target.ras_from_ijk)
-
-
-def bounding_box(inside: Array, margin: Array) -> tuple[slice, slice, slice]:
-    """Slices around the true voxels, `margin` voxels wider, clipped to the array."""
-    found = [np.flatnonzero(inside.any(axis=tuple(m for m in range(3) if m != axis))) for axis in range(3)]
-    lo = [max(int(f[0]) - int(g), 0) for f, g in zip(found, margin, strict=True)]
-    hi = [int(f[-1]) + int(g) + 1 for f, g in zip(found, margin, strict=True)]
-    return slice(lo[0], hi[0]), slice(lo[1], hi[1]), slice(lo[2], hi[2])
-
-
-def dilate(inside: Array, radius_mm: float, spacing: Array) -> Array:
-    """Voxels within `radius_mm` of `inside` (a ball, voxels `spacing` mm wide)."""
-    if not inside.any():
-        return inside.copy()
-    box = bounding_box(inside, np.ceil(radius_mm / spacing) + 1)
-    out = np.zeros_like(inside)
-    out[box] = ndimage.distance_transform_edt(~inside[box], sampling=spacing) <= radius_mm + TIE_MM
-    return out
-
-
-def erode(inside: Array, radius_mm: float, spacing: Array) -> Array:
-    """Voxels farther than `radius_mm` from everything outside; the image's border does not erode."""
-    if not inside.any() or inside.all():
-        return inside.copy()
-    box = bounding_box(inside, np.ceil(radius_mm / spacing) + 1)
-    out = np.zeros_like(inside)
-    out[box] = ndimage.distance_transform_edt(inside[box], sampling=spacing) > radius_mm + TIE_MM
-    return out
-
-
-def close(inside: Array, radius_mm: float, spacing: Array) -> Array:
-    """Closing by a ball of `radius_mm`: dents and holes that the ball cannot enter are filled."""
-    return erode(dilate(inside, radius_mm, spacing), radius_mm, spacing) | inside
-
-
-def largest(inside: Array, structure: Array | None = None) -> Array:
-    """The largest connected part (empty when `inside` is)."""
-    labels, count = ndimage.label(inside, structure)
-    if count == 0:
-        return inside.copy()
-    sizes = np.bincount(labels.ravel())
-    sizes[0] = 0
-    return labels == int(sizes.argmax())
-
-
-def touching(inside: Array, seed: Array) -> Array:
-    """The connected parts of `inside` that share a voxel with `seed`."""
-    labels, count = ndimage.label(inside)
-    chosen = np.zeros(count + 1, dtype=bool)
-    chosen[np.unique(labels[seed & inside])] = True
-    chosen[0] = False
-    return chosen[labels]

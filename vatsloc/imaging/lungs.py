@@ -8,10 +8,11 @@ from typing import Literal
 import numpy as np
 from scipy import ndimage
 
+from registration.images.morphology import close, dilate, erode, largest
 from registration.volume import Array, Grid, Mask, Volume
 from vatsloc.errors import InputRefused
 from vatsloc.imaging.airways import grow_airways, trachea
-from vatsloc.imaging.lattice import close, dilate, erode, largest, on_grid, working_copy
+from vatsloc.imaging.lattice import on_grid, working_copy
 
 Side = Literal["left", "right"]
 

@@ -8,10 +8,11 @@ import numpy as np
 from scipy import ndimage
 from skimage.segmentation import watershed
 
+from registration.images.morphology import bounding_box, close, dilate, erode
 from registration.volume import Array, Grid, Mask, Volume
 from vatsloc.imaging.airways import TrackedAirways
 from vatsloc.imaging.cbct import PreparedCbct
-from vatsloc.imaging.lattice import bounding_box, close, dilate, erode, on_grid, working_copy
+from vatsloc.imaging.lattice import on_grid, working_copy
 from vatsloc.imaging.thorax import AERATED_HU, ThoraxPrior, lung_space, working_scene
 
 FINE_MM = 1.0

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
+from registration.images.morphology import close, dilate
 from registration.volume import Array, Mask, Volume
 from vatsloc.errors import InputRefused
-from vatsloc.imaging.lattice import close, dilate, on_grid, working_copy
+from vatsloc.imaging.lattice import on_grid, working_copy
 
 SPACING_MM = 2.5
 BODY_RADIUS_MM = 16.0

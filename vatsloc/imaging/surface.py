@@ -9,10 +9,10 @@ import numpy as np
 from scipy import ndimage
 from skimage.measure import marching_cubes
 
-from registration.interpolate import interpolate
+from registration.images.interpolate import interpolate
+from registration.images.morphology import bounding_box
 from registration.volume import Array, Mask, Volume
 from vatsloc.imaging.cbct import FieldOfView
-from vatsloc.imaging.lattice import bounding_box
 from vatsloc.imaging.pleura import Pneumothorax
 
 SPACING_MM = 3.0

@@ -7,13 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from registration.field import PointMap
-from registration.resample import resample_mask
+from registration.images.morphology import close, dilate, erode, largest
+from registration.images.resample import resample_mask
+from registration.maps.field import PointMap
 from registration.volume import Array, Grid, Mask, Volume
 from vatsloc.errors import InputRefused
 from vatsloc.imaging.airways import TrackedAirways, track_airways
 from vatsloc.imaging.cbct import FieldOfView, PreparedCbct
-from vatsloc.imaging.lattice import close, dilate, erode, largest, on_grid, working_copy
+from vatsloc.imaging.lattice import on_grid, working_copy
 from vatsloc.imaging.lungs import Lungs, Side
 
 SPACING_MM = 2.0

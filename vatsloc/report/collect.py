@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from poro.mesh import TetMesh
-from registration.rigid import RigidTransform
+from registration.maps.rigid import RigidTransform
 from registration.volume import Array
 from vatsloc.case import Case
 from vatsloc.formats.meshes import Surface, TetraMesh

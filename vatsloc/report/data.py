@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from registration.rigid import RigidTransform
+from registration.maps.rigid import RigidTransform
 from registration.volume import Array, Mask, Volume
 from vatsloc.formats.meshes import Surface
 

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from registration.field import DisplacementField, PointMap, compose
-from registration.resample import coarsen, resample_mask
+from registration.images.resample import coarsen, resample_mask
+from registration.maps.field import DisplacementField, PointMap, compose
 from registration.volume import Array, Grid, Volume
 from vatsloc.case import read_case
 from vatsloc.evaluation.inputs import read_truth, seen_in

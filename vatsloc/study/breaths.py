@@ -11,7 +11,7 @@ from scipy import ndimage
 
 from poro.mesh import TetMesh, stuff
 from poro.mesh.tetmesh import Array
-from registration.resample import resample_mask
+from registration.images.resample import resample_mask
 from registration.volume import Mask
 from vatsloc.errors import CaseError, InputRefused
 from vatsloc.formats.images import read_mask

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from poro.fit import FitStatus
-from registration.rigid import RigidTransform
+from registration.maps.rigid import RigidTransform
 from registration.volume import Array
 from vatsloc.case import Case, read_case
 from vatsloc.errors import InputRefused, NotConverged, VatslocError

@@ -8,14 +8,14 @@ from enum import Enum
 from math import inf
 from typing import Any, cast
 
-from registration.corrected import CorrectedMap
 from registration.ffd import FfdFit, FfdSettings, register_ffd
-from registration.field import PointMap, compose
-from registration.nearby import grown
-from registration.newton import Stop
-from registration.resample import coarsen, resample_mask
-from registration.rigid import RigidTransform
+from registration.images.morphology import dilate
+from registration.images.resample import coarsen, resample_mask
+from registration.maps.composite import CompositeTransform
+from registration.maps.field import PointMap, compose
+from registration.maps.rigid import RigidTransform
 from registration.sliding import BEYOND_MM, masked, register_sliding
+from registration.terms.gauss_newton import Stop
 from registration.volume import Mask, Volume
 from vatsloc.errors import CaseError
 from vatsloc.study.elastix import ElastixSettings, run_elastix
@@ -66,12 +66,13 @@ def plain(fixed: Volume, moving: Volume, _lung: Mask, settings: FfdSettings, **g
 
 def masked_only(fixed: Volume, moving: Volume, moving_lung: Mask, settings: FfdSettings, **given: Any) -> FfdFit:
     """The paper's: both images masked outside their lungs, compared 5 mm beyond. Ref: Alvarez 2021, section 6.1.4."""
-    region = grown(given["fixed_lung"], BEYOND_MM)
+    lung: Mask = given["fixed_lung"]
+    near = dilate(lung.inside, BEYOND_MM, lung.grid.spacing)
     return register_ffd(
-        masked(fixed, given["fixed_lung"]),
+        masked(fixed, lung),
         masked(moving, moving_lung),
         settings,
-        fixed_mask=Mask(region.inside & given["seen"].inside, region.ras_from_ijk),
+        fixed_mask=Mask(near & given["seen"].inside, lung.ras_from_ijk),
         prior=given["prior"],
     )
 
@@ -84,7 +85,7 @@ def elastix(fixed: Volume, moving: Volume, _lung: Mask, settings: FfdSettings, *
     moving = Volume(moving.hu, pose.inverse().matrix @ moving.ras_from_ijk)
     run = run_elastix(fixed, moving, resample_mask(lung, fixed.grid), ElastixSettings(grid_mm=settings.spacing_mm))
     found: PointMap = compose(pose, run.moving_from_fixed)
-    return FfdFit(cast(CorrectedMap, found), Stop.ITERATIONS, (), float("nan"), 0.0, 1.0)
+    return FfdFit(cast(CompositeTransform, found), Stop.ITERATIONS, (), float("nan"), 0.0, 1.0)
 
 
 _OFF = {"on": False}

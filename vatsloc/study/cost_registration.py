@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from registration.resample import coarsen, resample, resample_mask
-from registration.rigid import RigidTransform
+from registration.images.resample import coarsen, resample, resample_mask
+from registration.maps.rigid import RigidTransform
 from registration.sliding import register_sliding
 from registration.volume import Array, Mask, Volume
 from vatsloc.study.isolated import isolated

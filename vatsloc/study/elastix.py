@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from registration.field import DisplacementField
+from registration.maps.field import DisplacementField
 from registration.volume import Array, Grid, Mask, Volume
 from vatsloc.frames import flip_affine, flip_field
 from vatsloc.workflow.stages import Stages

@@ -15,7 +15,7 @@ from poro.fit import FitStatus, bounds, fit
 from poro.model import PoroSystem, assemble
 from poro.observations import Target
 from poro.tissue import Tissue
-from registration.rigid import RigidTransform
+from registration.maps.rigid import RigidTransform
 from registration.volume import Array
 from vatsloc.case import Case, read_case
 from vatsloc.errors import VatslocError

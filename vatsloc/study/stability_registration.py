@@ -17,8 +17,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from registration.ffd import FfdFit, FfdSettings
-from registration.field import PointMap
-from registration.rigid import RigidTransform
+from registration.maps.field import PointMap
+from registration.maps.rigid import RigidTransform
 from registration.sliding import register_sliding
 from registration.spine import register_spine
 from registration.volume import Array, Grid, Mask, Volume

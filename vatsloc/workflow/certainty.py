@@ -89,9 +89,9 @@ def nearest_places(collapse: Collapse, deflated: Array) -> tuple[Array, Array]:
     (n,) the answer misses the nearest few of them on average.
     """
     pairs, before = collapse.model.pairs, collapse.mesh_before
-    moved = interpolate(locate(before, pairs.first), collapse.mesh_after.points - before.points)
-    missed = np.linalg.norm(pairs.first + moved - pairs.second, axis=1)
-    distance, number = cKDTree(pairs.second).query(deflated, min(PLACES, len(pairs)))
+    moved = interpolate(locate(before, pairs.moving), collapse.mesh_after.points - before.points)
+    missed = np.linalg.norm(pairs.moving + moved - pairs.fixed, axis=1)
+    distance, number = cKDTree(pairs.fixed).query(deflated, min(PLACES, len(pairs)))
     return distance[:, 0], missed[number].mean(axis=1)
 
 

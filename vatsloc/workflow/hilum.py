@@ -8,13 +8,14 @@ from enum import Enum
 import numpy as np
 
 from registration.ffd import FfdSettings, Weights, register_ffd
-from registration.field import PointMap
-from registration.inversion import invert_at
-from registration.rigid import RigidTransform
+from registration.images.morphology import dilate
+from registration.maps.field import PointMap
+from registration.maps.inversion import invert_at
+from registration.maps.rigid import RigidTransform
 from registration.volume import Array, Mask
 from vatsloc.imaging.cbct import PreparedCbct
 from vatsloc.imaging.hilum import Hilum, track_hilum
-from vatsloc.imaging.lattice import dilate, on_grid, working_copy
+from vatsloc.imaging.lattice import on_grid, working_copy
 
 AIRWAY_RIM_MM = 5.0
 FARTHEST_MM = 30.0

@@ -21,7 +21,7 @@ from poro.model import PoroStatus, PoroSystem, assemble
 from poro.modes import hilum_modes, shape_modes
 from poro.observations import Target
 from poro.tissue import Tissue
-from registration.matching import Pairs
+from registration.correspondences import Correspondences
 from registration.volume import Array
 from vatsloc.imaging.surface import Border, SurfacePoints
 from vatsloc.workflow.choices import Choice
@@ -59,16 +59,16 @@ class Rung:
 class Model:
     """The collapse by mechanics. displacement: (n, 3) mm at the nodes of system.mesh, correction included.
 
-    pairs: places found again, in the deflated CBCT's frame: `first` before the collapse (placed by the spine), `second`
-    after it; rungs: what was tried beyond the plain fit; solid: which strain measure the plain fit ended with, and why;
-    others: (k, n, 3) mm, how far from `displacement` other answers lie: without any rung those of `other_answers`, with
-    one that of the model that has not seen all places.
+    pairs: keypoints matched in both CBCTs, in the deflated one's frame: `moving` before the collapse (placed by the
+    spine), `fixed` after it; rungs: what was tried beyond the plain fit; solid: which strain measure the plain fit
+    ended with, and why; others: (k, n, 3) mm, how far from `displacement` other answers lie: without any rung those of
+    `other_answers`, with one that of the model that has not seen all places.
     """
 
     system: PoroSystem
     fit: Fit
     displacement: Array
-    pairs: Pairs
+    pairs: Correspondences
     rungs: tuple[Rung, ...]
     solid: Chosen
     others: Array
@@ -132,7 +132,7 @@ def best_of(steps: dict[str, Step], model: Model, blind: Model, surface: Target)
     """Steps are first tried on the model that has not seen the hidden pairs. The one that predicts them best, if better
     than without, is taken again with all pairs for the model proper; where that fails, the next best is.
     """
-    mesh, hidden = model.system.mesh, held_back(model.pairs.second)
+    mesh, hidden = model.system.mesh, held_back(model.pairs.fixed)
     unseen, shown = model.pairs.only(hidden), _with(surface, model.pairs.only(~hidden))
     trials = {name: step(blind, shown, blind.fit) for name, step in steps.items()}
     before = misfit(mesh, blind.displacement, unseen)
@@ -151,9 +151,9 @@ def _settled(model: Model) -> bool:
     return model.fit.status is not FitStatus.CONTACT and model.fit.state.status is not PoroStatus.NOT_SETTLED
 
 
-def _too_few(pairs: Pairs) -> str | None:
+def _too_few(pairs: Correspondences) -> str | None:
     """Why pairs cannot judge a rung; None when they can."""
-    hidden = held_back(pairs.second)
+    hidden = held_back(pairs.fixed)
     if len(pairs) < LEAST_PAIRS:
         return f"only {len(pairs)} places inside the lung were found again"
     if min(hidden.sum(), (~hidden).sum()) < LEAST_PAIRS // 4:
@@ -161,7 +161,7 @@ def _too_few(pairs: Pairs) -> str | None:
     return None
 
 
-NO_PAIRS = Pairs(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
+NO_PAIRS = Correspondences.none()
 NO_OTHERS = np.zeros((0, 0, 3))
 
 
@@ -186,14 +186,14 @@ def fit_settings(settings: Settings, modes: int = 0) -> FitSettings:
     return FitSettings(plain=plain, free=free, max_steps=steps, keypoint_sigma_mm=sigma, kappa_decades=decades)
 
 
-def _with(target: Target, pairs: Pairs) -> Target:
-    return replace(target, inflated=pairs.first, deflated=pairs.second, keypoint_weights=np.ones(len(pairs)))
+def _with(target: Target, pairs: Correspondences) -> Target:
+    return replace(target, inflated=pairs.moving, deflated=pairs.fixed, keypoint_weights=pairs.weights)
 
 
-def misfit(mesh: TetMesh, displacement: Array, pairs: Pairs) -> float:
+def misfit(mesh: TetMesh, displacement: Array, pairs: Correspondences) -> float:
     """Median distance in mm between where displacements (n, 3) of a mesh put places and where they were found."""
-    moved = pairs.first + interpolate(locate(mesh, pairs.first), displacement)
-    return float(np.median(np.linalg.norm(moved - pairs.second, axis=1)))
+    moved = pairs.moving + interpolate(locate(mesh, pairs.moving), displacement)
+    return float(np.median(np.linalg.norm(moved - pairs.fixed, axis=1)))
 
 
 def _regional(gravity: Array, settings: Settings) -> Step:

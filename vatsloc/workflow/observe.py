@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from poro.mesh import TetMesh, TriSurface, stuff
-from registration.resample import resample_mask
-from registration.rigid import RigidTransform
+from registration.images.resample import resample_mask
+from registration.maps.rigid import RigidTransform
 from registration.spine import RigidFit, register_spine
 from registration.volume import Array
 from vatsloc.case import Case

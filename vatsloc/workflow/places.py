@@ -5,11 +5,12 @@ on where those that were found do.
 from __future__ import annotations
 
 from poro.mesh import TetMesh
-from registration.growing import GrowSettings, grow
-from registration.matching import MatchSettings, Pairs, match_keypoints
-from registration.resample import coarsen, resample_mask
+from registration.correspondences import Correspondences
+from registration.images.morphology import erode
+from registration.images.resample import coarsen, resample_mask
+from registration.keypoints.matching import MatchSettings, match_keypoints
+from registration.keypoints.propagation import PropagationSettings, propagate_matches
 from registration.volume import Array, Mask, Volume
-from vatsloc.imaging.lattice import erode
 from vatsloc.maps import MeshMap, covered
 from vatsloc.workflow.observe import Observed
 from vatsloc.workflow.prepare import Prepared
@@ -20,11 +21,13 @@ RIM_MM = 2.0
 """So far from the lung's border its images show what lies beyond."""
 
 
-def inner_pairs(prepared: Prepared, observed: Observed, displacement: Array, settings: KeypointSettings) -> Pairs:
+def inner_pairs(
+    prepared: Prepared, observed: Observed, displacement: Array, settings: KeypointSettings
+) -> Correspondences:
     """Places inside the lung that both CBCTs show, looked for about where a displacement (n, 3) mm puts them, and then
     about where those found next to them say.
 
-    `first` is where they lie before the collapse, placed by the spine.
+    `moving` is where they lie before the collapse, placed by the spine.
     """
     match = MatchSettings(voxel_mm=settings.voxel_mm, reach_mm=settings.reach_mm)
     expected = _expected(prepared, observed, displacement, match)
@@ -38,17 +41,17 @@ def inner_pairs(prepared: Prepared, observed: Observed, displacement: Array, set
         resample_mask(observed.found.lung, deflated.grid),
         resample_mask(prepared.deflated.field.usable, deflated.grid).inside,
     )
-    return grow(placed, deflated, before, after, expected, GrowSettings(match))
+    return propagate_matches(deflated, placed, after, before, expected, PropagationSettings(match))
 
 
-def _expected(prepared: Prepared, observed: Observed, displacement: Array, match: MatchSettings) -> Pairs:
+def _expected(prepared: Prepared, observed: Observed, displacement: Array, match: MatchSettings) -> Correspondences:
     """Places found within reach of where a displacement (n, 3) mm of the model's mesh puts them."""
     rest, rigid = observed.model_mesh, observed.def_from_inf_rigid
     before = TetMesh(rigid.inverse()(rest.points), rest.tets)
     model = MeshMap(before, rest.points + displacement, rigid)
     view = view_of(prepared, observed.found.lung, model, match.voxel_mm)
-    pairs = match_keypoints(view.warped, view.deflated, view.lung, match, first_region=view.modelled)
-    return Pairs(rigid(model.inverse()(pairs.first)), pairs.second, pairs.ncc)
+    pairs = match_keypoints(view.deflated, view.warped, view.lung, match, moving_region=view.modelled)
+    return pairs.mapped(moving=lambda points: rigid(model.inverse()(points)))
 
 
 def _inner(lung: Mask, seen: Array) -> Mask:

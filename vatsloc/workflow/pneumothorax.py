@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -10,7 +10,7 @@ from poro.fit import Fit
 from poro.identify import Identifiability, identifiability
 from poro.mesh import TetMesh, TriSurface, interpolate, locate
 from poro.model import PoroSystem
-from registration.rigid import RigidTransform
+from registration.maps.rigid import RigidTransform
 from registration.volume import Array
 from vatsloc.case import Case
 from vatsloc.maps import MeshMap
@@ -105,7 +105,7 @@ def collapse(
             before,
             observed.surface,
             chosen,
-            replace(model.pairs, first=rigid.inverse()(model.pairs.first)),
+            model.pairs.mapped(moving=rigid.inverse()),
         )
     return Collapse(observed, model, residual, after if residual is None else after + residual.displacement)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 from scipy import ndimage
@@ -13,12 +12,10 @@ from poro.extrapolate import Extrapolation, extrapolate
 from poro.mesh import TetMesh, stuff
 from poro.tissue import Tissue
 from registration.ffd import FfdFit, FfdSettings, Weights
-from registration.field import PointMap
-from registration.inversion import Inversion, invert_at
-from registration.penalties import Keypoints
-from registration.resample import coarsen_mask
-from registration.rigid import RigidTransform
-from registration.sliding import register_sliding
+from registration.images.resample import coarsen_mask
+from registration.maps.inversion import Inversion, invert_at
+from registration.maps.rigid import RigidTransform
+from registration.sliding import SlidingFit, register_sliding
 from registration.spine import RigidFit, SpineSearch, register_spine
 from registration.volume import Array, Mask
 from vatsloc.case import Case
@@ -115,9 +112,11 @@ def change_of_pose(
             fixed_lung=lung_inf,
             seen=prepared.inflated.field.usable,
             prior=ct_from_inf_rigid,
-            is_far=partial(is_far, ct_from_inf_rigid, settings.leave_out.first_registration_mm, stages),
+            coarse_beyond_mm=settings.leave_out.first_registration_mm,
             progress=lambda what, _share: stages.say(what),
         )
+        if isinstance(ffd, SlidingFit):
+            stages.choose(moved_far(ffd, settings.leave_out.first_registration_mm))
     with stages.stage("inversion and extrapolation"):
         inversion = invert_at(ffd.moving_from_fixed, mesh.points, placed.points)
         settled = inversion.residual_mm < settings.gates.max_inversion_mm
@@ -141,14 +140,12 @@ def change_of_pose(
     )
 
 
-def is_far(prior: PointMap, limit_mm: float, stages: Stages, places: Keypoints | None) -> bool:
-    """Whether places inside the lung moved so far that the coarse levels are needed."""
-    if places is None:
-        moved, seen = np.inf, "too few places inside the lung were found about the spine's pose"
-    else:
-        moved = float(np.percentile(np.linalg.norm(places.moving - prior(places.fixed), axis=1), 95))
-        seen = f"95 % of {len(places.fixed)} places inside the lung moved by at most {moved:.1f} mm against the spine"
-    return stages.choose(weigh(FIRST, moved, limit_mm, seen))
+def moved_far(fit: SlidingFit, limit_mm: float) -> Choice:
+    """Whether places inside the lung moved so far that the coarse levels were needed."""
+    moved, seen = fit.moved_mm, "too few places inside the lung were found about the spine's pose"
+    if fit.matched:
+        seen = f"95 % of {fit.matched} places inside the lung moved by at most {moved:.1f} mm against the spine"
+    return weigh(FIRST, moved, limit_mm, seen)
 
 
 def extrapolated(seen: Array) -> Choice:

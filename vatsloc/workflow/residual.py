@@ -16,12 +16,11 @@ from scipy.spatial import cKDTree
 from poro.extrapolate import extrapolate
 from poro.mesh import TetMesh
 from poro.tissue import Tissue
+from registration.correspondences import Correspondences
 from registration.ffd import FfdSettings, Weights, register_ffd
-from registration.inversion import invert_at
-from registration.matching import Pairs
-from registration.penalties import Keypoints
+from registration.images.morphology import dilate, erode
+from registration.maps.inversion import invert_at
 from registration.volume import Array, Mask
-from vatsloc.imaging.lattice import dilate, erode
 from vatsloc.imaging.surface import Border, SurfacePoints
 from vatsloc.maps import MeshMap
 from vatsloc.workflow.prepare import Prepared
@@ -67,7 +66,7 @@ def residual_registration(
     mesh_before: TetMesh,
     surface: SurfacePoints,
     settings: ResidualSettings,
-    pairs: Pairs,
+    pairs: Correspondences,
 ) -> Residual | None:
     """Displacements that take the modelled nodes to where the images show their tissue; None where too little is seen.
 
@@ -88,14 +87,11 @@ def residual_registration(
         voxel_mm=settings.voxel_mm,
         weights=Weights(bending=settings.bending, keypoints=settings.keypoints),
     )
-    expected_at, weights = def_from_inf(pairs.first), np.ones(len(pairs))
-    forth, homeward = (
-        Keypoints(one, other, weights) if len(pairs) else None
-        for one, other in ((pairs.second, expected_at), (expected_at, pairs.second))
-    )
+    expected_at = pairs.mapped(moving=def_from_inf)
+    forth, homeward = (expected_at, expected_at.swapped()) if len(pairs) else (None, None)
     register = partial(register_ffd, settings=ffd, moving_mask=view.both_see)
-    there = register(view.deflated, view.warped, fixed_mask=observed, keypoints=forth)
-    back = register(view.warped, view.deflated, fixed_mask=expected, keypoints=homeward)
+    there = register(view.deflated, view.warped, fixed_mask=observed, matches=forth)
+    back = register(view.warped, view.deflated, fixed_mask=expected, matches=homeward)
     inverse = invert_at(there.moving_from_fixed, nodes, nodes)
     placed, other = inverse.points_fixed, back.moving_from_fixed(nodes)
     disagreement = np.linalg.norm(placed - other, axis=1)

@@ -10,8 +10,8 @@ import numpy as np
 
 from poro.mesh import TetMesh
 from poro.mesh.tetmesh import signed_volumes
-from registration.field import DisplacementField
-from registration.resample import resample, resample_mask
+from registration.images.resample import resample, resample_mask
+from registration.maps.field import DisplacementField
 from registration.spine import RigidFit
 from registration.volume import Array, Grid, Mask, Volume
 from vatsloc.case import Case, read_case

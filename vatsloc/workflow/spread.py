@@ -10,7 +10,7 @@ import numpy as np
 from poro.fit import Fit, FitSettings, fit
 from poro.model import PoroStatus, PoroSystem
 from poro.observations import Target
-from registration.rigid import RigidTransform
+from registration.maps.rigid import RigidTransform
 from registration.volume import Array
 
 STARTS = ((1e-10, 0.6, 5.0), (1e-6, 0.9, 15.0))

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from poro.mesh import TetMesh
-from registration.field import DisplacementField
-from registration.resample import coarsen, resample, resample_mask
+from registration.images.resample import coarsen, resample, resample_mask
+from registration.maps.field import DisplacementField
 from registration.volume import Mask, Volume
 from vatsloc.maps import MeshMap, covered, sampled
 from vatsloc.workflow.prepare import Prepared

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from registration.banded import Banded, along_axes
-from registration.field import DisplacementField, PointMap, slabs
-from registration.interpolate import interpolate
+from registration.images.interpolate import interpolate
+from registration.kernels.banded import Banded, along_axes
+from registration.maps.field import DisplacementField, PointMap, slabs
 from registration.volume import Array, Grid, Mask, Volume
 
 

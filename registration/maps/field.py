@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 from numba import njit, prange
 
+from registration.kernels.trilinear import lower, value
 from registration.volume import Array, Grid
 
 PointMap = Callable[[Array], Array]
@@ -44,7 +45,10 @@ class DisplacementField:
         """u (n, 3) in mm at points (n, 3) in RAS mm."""
         points = np.ascontiguousarray(self.grid.to_ijk(np.asarray(points_ras, dtype=float)))
         out = np.empty((len(points), 3))
-        _vectors(np.ascontiguousarray(self.vectors), points, out)
+        vectors = self.vectors
+        if 1 in self.grid.shape:  # a cell has two voxels along every axis
+            vectors = np.pad(vectors, [(0, int(n == 1)) for n in vectors.shape], mode="edge")
+        _vectors(np.ascontiguousarray(vectors), points, out)
         return out
 
     def __call__(self, points_ras: Array) -> Array:
@@ -91,17 +95,9 @@ def _vectors(vectors, points, out):
         x = min(max(points[n, 0], 0.0), ni - 1.0)
         y = min(max(points[n, 1], 0.0), nj - 1.0)
         z = min(max(points[n, 2], 0.0), nk - 1.0)
-        i, j, k = max(min(int(x), ni - 2), 0), max(min(int(y), nj - 2), 0), max(min(int(z), nk - 2), 0)
-        i1, j1, k1 = min(i + 1, ni - 1), min(j + 1, nj - 1), min(k + 1, nk - 1)
-        a, b, c = x - i, y - j, z - k
+        i, j, k = lower(x, ni), lower(y, nj), lower(z, nk)
         for m in range(3):
-            low = (vectors[i, j, k, m] * (1 - c) + vectors[i, j, k1, m] * c) * (1 - b) + (
-                vectors[i, j1, k, m] * (1 - c) + vectors[i, j1, k1, m] * c
-            ) * b
-            high = (vectors[i1, j, k, m] * (1 - c) + vectors[i1, j, k1, m] * c) * (1 - b) + (
-                vectors[i1, j1, k, m] * (1 - c) + vectors[i1, j1, k1, m] * c
-            ) * b
-            out[n, m] = low * (1 - a) + high * a
+            out[n, m] = value(vectors[:, :, :, m], i, j, k, x - i, y - j, z - k)
 
 
 @njit(cache=True, parallel=True)

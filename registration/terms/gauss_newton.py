@@ -8,7 +8,7 @@ from enum import Enum
 
 import numpy as np
 
-from registration.objective import Model, Term
+from registration.terms.objective import QuadraticModel, Term
 from registration.volume import Array
 
 
@@ -21,13 +21,33 @@ class Stop(Enum):
     NO_DESCENT = "no step along the Gauss-Newton direction lowered the objective"
 
 
+class SolveStatus(Enum):
+    """Why conjugate gradients ended."""
+
+    SOLVED = "the residual fell to the tolerance"
+    ITERATIONS = "the allowed number of iterations was used up"
+    NEGATIVE_CURVATURE = "the Hessian is not positive definite along a search direction; the step so far is kept"
+
+
+@dataclass(frozen=True)
+class Solve:
+    """step: (3, ni, nj, nk), mm; residuals: |H d + g| / |g| before each iteration and at the end."""
+
+    step: Array
+    status: SolveStatus
+    residuals: tuple[float, ...]
+
+
 @dataclass(frozen=True)
 class Descent:
-    """coefficients: (3, ni, nj, nk), mm; history: objective before each step and at the end."""
+    """coefficients: (3, ni, nj, nk), mm; history: objective before each step and at the end; solves: status and
+    relative residuals of the conjugate gradients of each step.
+    """
 
     coefficients: Array
     stop: Stop
     history: tuple[float, ...]
+    solves: tuple[tuple[SolveStatus, tuple[float, ...]], ...]
 
 
 def gauss_newton(
@@ -48,13 +68,20 @@ def gauss_newton(
     """
     c: Array = start.astype(np.float32)
     history: list[float] = []
+    solves: list[tuple[SolveStatus, tuple[float, ...]]] = []
+
+    def ended(at: Array, stop: Stop, *last: float) -> Descent:
+        return Descent(at, stop, (*history, *last), tuple(solves))
+
     for _ in range(steps):
         if refresh is not None:
             refresh(c)
         model = objective.model(c)
         value = model.value
         history.append(value)
-        d = conjugate_gradients(model, residual)
+        solve = conjugate_gradients(model, residual)
+        solves.append((solve.status, solve.residuals))
+        d = solve.step
         slope = float(np.vdot(model.gradient, d))
         scale, trial, new = 1.0, c + d, objective.value(c + d)
         while new > value + 1e-4 * scale * slope and scale > 0.02:
@@ -62,32 +89,44 @@ def gauss_newton(
             trial = c + np.float32(scale) * d
             new = objective.value(trial)
         if new >= value:
-            return Descent(c, Stop.NO_DESCENT, (*history,))
+            return ended(c, Stop.NO_DESCENT)
         c = trial
         if value - new < tolerance * abs(value):
-            return Descent(c, Stop.CONVERGED, (*history, new))
+            return ended(c, Stop.CONVERGED, new)
         if scale * np.abs(d).max() < step_mm:
-            return Descent(c, Stop.SMALL_STEP, (*history, new))
-    return Descent(c, Stop.ITERATIONS, (*history, new))
+            return ended(c, Stop.SMALL_STEP, new)
+    return ended(c, Stop.ITERATIONS, new)
 
 
-def conjugate_gradients(model: Model, tolerance: float = 0.1, iterations: int = 40) -> Array:
-    """Solve H d = -gradient to the relative residual `tolerance`, Jacobi-preconditioned, in float32."""
+def conjugate_gradients(model: QuadraticModel, tolerance: float = 0.1, iterations: int = 40) -> Solve:
+    """Solve H d = -gradient to the relative residual `tolerance`, Jacobi-preconditioned, in float32.
+
+    Where H turns out not to be positive definite, the step so far is the answer, the preconditioned gradient if there
+    was none. Ref: Steihaug 1983.
+    """
     right = -model.gradient.astype(np.float32)
     diagonal = model.diagonal
     inverse = (1 / np.maximum(diagonal, 1e-3 * diagonal.max())).astype(np.float32)
     x, r = np.zeros_like(right), right.copy()
     z = inverse * r
     p, rz = z.copy(), float(np.vdot(r, z))
-    limit = tolerance * float(np.linalg.norm(right))
-    for _ in range(iterations):
-        if np.linalg.norm(r) <= limit:
+    whole = float(np.linalg.norm(right))
+    limit, residuals = tolerance * whole, []
+    for done in range(iterations + 1):
+        left = np.linalg.norm(r)
+        residuals.append(float(left) / whole if whole else 0.0)
+        if left <= limit:
+            return Solve(x, SolveStatus.SOLVED, tuple(residuals))
+        if done == iterations:
             break
         hp = model.apply(p)
-        alpha = np.float32(rz / max(float(np.vdot(p, hp)), 1e-30))
+        curvature = float(np.vdot(p, hp))
+        if curvature <= 0:
+            return Solve(x if done else p, SolveStatus.NEGATIVE_CURVATURE, tuple(residuals))
+        alpha = np.float32(rz / curvature)
         x += alpha * p
         r -= alpha * hp
         z = inverse * r
         rz, old = float(np.vdot(r, z)), rz
         p = z + np.float32(rz / old) * p
-    return x
+    return Solve(x, SolveStatus.ITERATIONS, tuple(residuals))

@@ -1,24 +1,18 @@
-"""Volume change of T(x) = P(x) + u(x) at block centres: its determinant, and a barrier against folding.
-
-Ref: Modat 2012 (penalty on the Jacobian determinant of a B-spline); the barrier's shape is our own.
-"""
+"""The Jacobian dT/dx of T(x) = P(x) + u(x) at block centres, its determinant and cofactors."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from registration.banded import Banded, along_axes
-from registration.bspline import basis_derivative
-from registration.corrected import is_separable
-from registration.field import PointMap
+from registration.kernels.banded import Banded, along_axes
+from registration.maps.bspline import basis_derivative
+from registration.maps.composite import is_separable
+from registration.maps.field import PointMap
 from registration.volume import Array, Grid
 
-KNEE = 0.3
-FLOOR = 0.02
 
-
-class Stretch:
-    """Gradient F = dT/dx of the whole map on the centres of a block grid.
+class Jacobian:
+    """F = dT/dx of the whole map on the centres of a block grid.
 
     control: control points of u; blocks: grid parallel to it; prior: P, whose own gradient is exact where it is made of
     splines, and else by central differences over 1 mm.
@@ -53,7 +47,7 @@ class Stretch:
 def _gradient(prior: PointMap, blocks: Grid) -> Array:
     """dP_a / dx_b, (3, 3, bi, bj, bk)."""
     if is_separable(prior, blocks):
-        below = Stretch(prior.field.control, blocks, prior.prior)
+        below = Jacobian(prior.field.control, blocks, prior.prior)
         return below.gradient(np.moveaxis(prior.field.coefficients, 3, 0))
     points = blocks.points().reshape(-1, 3)
     rows = [(prior(points + 0.5 * e) - prior(points - 0.5 * e)).T for e in np.eye(3)]
@@ -69,16 +63,3 @@ def cofactor(f: Array) -> Array:
     """Derivative of det F by F, (3, 3, bi, bj, bk)."""
     rows = [np.cross(f[1], f[2], axis=0), np.cross(f[2], f[0], axis=0), np.cross(f[0], f[1], axis=0)]
     return np.stack(rows)
-
-
-def barrier(det: Array) -> tuple[Array, Array, Array]:
-    """Barrier (0.3 / det - 1)^2 where det < 0.3, else zero; its slope and a non-negative curvature, each like det.
-
-    Below det = 0.02 it goes on as a straight line, so that a folded start can still be mended.
-    """
-    d = np.maximum(det, FLOOR)
-    excess = np.maximum(KNEE / d - 1, 0)
-    slope = -2 * excess * KNEE / d**2
-    value = excess**2 + slope * (det - d)
-    curvature = np.where(excess > 0, 2 * (KNEE / d**2) ** 2, 0)
-    return value, slope, curvature

@@ -12,8 +12,8 @@ import numpy as np
 from numba import njit, prange
 from scipy import sparse
 
-from registration.banded import Banded, along_axes
-from registration.field import DisplacementField
+from registration.kernels.banded import Banded, along_axes
+from registration.maps.field import DisplacementField
 from registration.volume import Array, Grid
 
 

@@ -1,23 +1,19 @@
-"""Voxels within a distance of a region: an exact Euclidean distance transform that stops looking beyond it."""
+"""Morphology of masks measured in millimetres: dilation, erosion, closing, connected parts.
+
+Arrays (ni, nj, nk) of bool in and out; spacing: (3,) mm.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 from numba import njit, prange
+from scipy import ndimage
 
-from registration.volume import Array, Cut, Mask
-
-
-def grown(mask: Mask, distance_mm: float) -> Mask:
-    """Every voxel whose centre lies within `distance_mm` of that of a voxel in the mask."""
-    cut = bounding_box(mask.inside, np.ceil(distance_mm / mask.grid.spacing).astype(int))
-    inside = mask.inside.copy()
-    inside[cut] = near(mask.inside[cut], distance_mm, mask.grid.spacing)
-    return Mask(inside, mask.ras_from_ijk)
+from registration.volume import Array, Cut
 
 
 def bounding_box(inside: Array, margin: Array) -> Cut:
-    """Slices about the true voxels of (ni, nj, nk), `margin` (3,) voxels wider, clipped to the array.
+    """Slices about the true voxels, `margin` (3,) voxels wider, clipped to the array.
 
     Raises ValueError where none is true.
     """
@@ -28,8 +24,52 @@ def bounding_box(inside: Array, margin: Array) -> Cut:
     return i, j, k
 
 
-def near(inside: Array, distance_mm: float, spacing: Array) -> Array:
-    """Which voxels of (ni, nj, nk) lie within `distance_mm` of a true one; spacing: (3,) mm.
+def dilate(inside: Array, radius_mm: float, spacing: Array) -> Array:
+    """Voxels whose centre lies within `radius_mm` of that of a true one."""
+    if not inside.any():
+        return inside.copy()
+    box = bounding_box(inside, np.ceil(radius_mm / np.asarray(spacing)) + 1)
+    out = np.zeros_like(inside)
+    out[box] = _within(inside[box], radius_mm, spacing)
+    return out
+
+
+def erode(inside: Array, radius_mm: float, spacing: Array) -> Array:
+    """Voxels farther than `radius_mm` from everything outside; the image's border does not erode."""
+    if not inside.any() or inside.all():
+        return inside.copy()
+    box = bounding_box(inside, np.ceil(radius_mm / np.asarray(spacing)) + 1)
+    out = np.zeros_like(inside)
+    out[box] = inside[box] & ~_within(~inside[box], radius_mm, spacing)
+    return out
+
+
+def close(inside: Array, radius_mm: float, spacing: Array) -> Array:
+    """Closing by a ball of `radius_mm`: dents and holes that the ball cannot enter are filled."""
+    return erode(dilate(inside, radius_mm, spacing), radius_mm, spacing) | inside
+
+
+def largest(inside: Array, structure: Array | None = None) -> Array:
+    """The largest connected part (empty when `inside` is)."""
+    labels, count = ndimage.label(inside, structure)
+    if count == 0:
+        return inside.copy()
+    sizes = np.bincount(labels.ravel())
+    sizes[0] = 0
+    return labels == int(sizes.argmax())
+
+
+def touching(inside: Array, seed: Array) -> Array:
+    """The connected parts of `inside` that share a voxel with `seed`."""
+    labels, count = ndimage.label(inside)
+    chosen = np.zeros(count + 1, dtype=bool)
+    chosen[np.unique(labels[seed & inside])] = True
+    chosen[0] = False
+    return chosen[labels]
+
+
+def _within(inside: Array, distance_mm: float, spacing: Array) -> Array:
+    """Which voxels lie within `distance_mm` of a true one: a Euclidean distance transform that looks no further.
 
     Squared distances axis by axis, each the least of its neighbours' plus a parabola. Ref: Felzenszwalb 2012.
     """

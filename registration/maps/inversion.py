@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from registration.field import DisplacementField, PointMap, compose
+from registration.maps.field import DisplacementField, PointMap, compose
 from registration.volume import Array, Grid
 
 

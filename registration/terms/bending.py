@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.polynomial.legendre import leggauss
 
-from registration.banded import Banded, along_axis
+from registration.kernels.banded import Banded, along_axis
 from registration.volume import Array, Grid
 
 

@@ -10,9 +10,9 @@ from registration.volume import Array
 
 
 @dataclass(frozen=True)
-class Model:
-    """A term near c. value; gradient: (3, ni, nj, nk), exact; apply: d -> H d with H a positive semidefinite
-    Gauss-Newton Hessian; diagonal: that of H, (3, ni, nj, nk)."""
+class QuadraticModel:
+    """A term near c, to second order. value; gradient: (3, ni, nj, nk), exact; apply: d -> H d with H a positive
+    semidefinite Gauss-Newton Hessian; diagonal: that of H, (3, ni, nj, nk)."""
 
     value: float
     gradient: Array
@@ -25,7 +25,7 @@ class Term(Protocol):
 
     def value(self, c: Array) -> float: ...
 
-    def model(self, c: Array) -> Model: ...
+    def model(self, c: Array) -> QuadraticModel: ...
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Objective:
         """Sum of the terms' values."""
         return sum(term.value(c) for term in self.terms)
 
-    def model(self, c: Array) -> Model:
+    def model(self, c: Array) -> QuadraticModel:
         """Sum of the terms' models."""
         models = [term.model(c) for term in self.terms]
         first, rest = models[0], models[1:]
@@ -49,7 +49,7 @@ class Objective:
                 out = out + m.apply(d)
             return out
 
-        return Model(
+        return QuadraticModel(
             sum(m.value for m in models),
             sum((m.gradient for m in rest), first.gradient),
             apply,

@@ -5,57 +5,26 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from math import prod
-from typing import Protocol
 
 import numpy as np
 
-from registration.bspline import Lattice
-from registration.corrected import is_separable
-from registration.field import PointMap
-from registration.interpolate import interpolate, warp_samples
-from registration.metric import Similarity
-from registration.objective import Model
-from registration.stretch import Stretch, cofactor, determinant
+from registration.images.interpolate import interpolate, warp_samples
+from registration.images.pyramid import Samples
+from registration.maps.bspline import Lattice
+from registration.maps.composite import is_separable
+from registration.maps.field import PointMap
+from registration.terms.metrics import Dissimilarity, Metric
+from registration.terms.objective import QuadraticModel
 from registration.volume import Array, Grid, Volume
 
-BLOCK = 2
 HESSIAN_BLOCK = 4
-
-
-class Metric(Protocol):
-    """A dissimilarity of the samples; see `registration.metric`."""
-
-    def evaluate(self, m: Array, w: Array) -> Similarity: ...
-
-
-@dataclass(frozen=True)
-class Samples:
-    """Voxels of the fixed image where images are compared. index: (n,) flat voxel indices on grid."""
-
-    grid: Grid
-    index: Array
-
-    def points(self) -> Array:
-        """Their centres, (n, 3), RAS mm."""
-        return self.grid.to_ras(np.stack(np.unravel_index(self.index, self.grid.shape), axis=1).astype(float))
-
-    def blocks(self, edge: int = BLOCK) -> tuple[Grid, Array]:
-        """Grid of blocks of edge^3 voxels, and the flat index (n,) of each sample's block."""
-        size = tuple(-(-n // edge) for n in self.grid.shape)
-        affine = self.grid.ras_from_ijk.copy()
-        affine[:3, :3] *= edge
-        affine[:3, 3] = self.grid.to_ras(np.full(3, (edge - 1) / 2))
-        i, j, k = np.unravel_index(self.index, self.grid.shape)
-        grid = Grid((size[0], size[1], size[2]), affine)
-        return grid, np.ravel_multi_index((i // edge, j // edge, k // edge), grid.shape)
 
 
 class ImageTerm:
     """D(f, m o T) over the samples.
 
     seen: where the moving image shows anything, in [0, 1]: samples that leave it lose their weight, which `refresh`
-    resets and every evaluation keeps. mass_preserving: compare with (m + 1000) det(dT/dx) - 1000, the HU of the same
-    mass in the fixed image's volume. What the line search saw last is kept, for the model is asked for there next.
+    resets and every evaluation keeps. What the line search saw last is kept, for the model is asked for there next.
     """
 
     def __init__(
@@ -66,7 +35,6 @@ class ImageTerm:
         prior: PointMap,
         control: Grid,
         seen: Volume | None = None,
-        mass_preserving: bool = False,
     ) -> None:
         self.samples, self._metric, self._moving, self._seen = samples, metric, moving, seen
         self._lattice = Lattice(control, samples.grid)
@@ -74,10 +42,8 @@ class ImageTerm:
         self._base = np.ascontiguousarray(moving.grid.to_ijk(self._points))
         self._a = np.ascontiguousarray(moving.grid.ijk_from_ras[:3, :3])
         self.share = np.ones(len(samples.index), dtype=np.float32)
-        blocks, self._coarse_block = samples.blocks(HESSIAN_BLOCK)
+        blocks, self._block = samples.blocks(HESSIAN_BLOCK)
         self._coarse = Lattice(control, blocks)
-        blocks, self._block = samples.blocks()
-        self._stretch = Stretch(control, blocks, prior) if mass_preserving else None
         self._last: tuple[Array, _Warped] | None = None
 
     def refresh(self, c: Array) -> None:
@@ -89,54 +55,40 @@ class ImageTerm:
 
     def value(self, c: Array) -> float:
         """D at c."""
-        return self._at(c).similarity.value
+        return self._at(c).dissimilarity.value
 
-    def model(self, c: Array) -> Model:
-        """D, its exact gradient, and a Gauss-Newton Hessian that leaves out how det(dT/dx) changes.
+    def model(self, c: Array) -> QuadraticModel:
+        """D, its exact gradient, and a Gauss-Newton Hessian.
 
         The samples' tensors h g g^T are summed over blocks of 4^3 voxels: splines eight voxels per cell hardly tell.
         """
         warped = self._at(c)
-        here, g = warped.similarity, warped.gradient
-        through_det: Array | None = None
-        if self._stretch is not None and warped.stretch is not None:
-            shape = warped.stretch.shape[2:]
-            slope = np.bincount(self._block, here.slope * (warped.m + 1000), prod(shape)).reshape(shape)
-            through_det = self._stretch.adjoint(slope * cofactor(warped.stretch))
-            g = g * determinant(warped.stretch).reshape(-1)[self._block].astype(g.dtype)
+        here, g = warped.dissimilarity, warped.gradient
         force = np.zeros((3, prod(self.samples.grid.shape)), dtype=g.dtype)
         force[:, self.samples.index] = here.slope * g
         gradient = self._lattice.adjoint(force.reshape(3, *self.samples.grid.shape)).astype(float)
-        if through_det is not None:
-            gradient += through_det
         pairs = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
         shape = self._coarse.grid.shape
-        sums = [np.bincount(self._coarse_block, here.curvature * g[a] * g[b], prod(shape)) for a, b in pairs]
+        sums = [np.bincount(self._block, here.curvature * g[a] * g[b], prod(shape)) for a, b in pairs]
         tensor = np.stack(sums).reshape(6, *shape).astype(np.float32)
         diagonal = self._coarse.adjoint_squared(tensor[[0, 3, 5]])
-        return Model(here.value, gradient, _tensor_product(self._coarse, tensor), diagonal)
+        return QuadraticModel(here.value, gradient, _tensor_product(self._coarse, tensor), diagonal)
 
     def _at(self, c: Array) -> _Warped:
         """The moving image seen through T at c."""
         if self._last is None or not np.array_equal(self._last[0], c):
             u = np.ascontiguousarray(self._lattice.forward(c).reshape(3, -1))
             m, g = warp_samples(self._moving.hu, self._base, u, self.samples.index, self._a)
-            stretch, mass = None, m
-            if self._stretch is not None:
-                stretch = self._stretch.gradient(c)
-                mass = (m + 1000) * determinant(stretch).reshape(-1)[self._block] - 1000
-            self._last = c.copy(), _Warped(m, g, self._metric.evaluate(mass, self.share), stretch)
+            self._last = c.copy(), _Warped(g, self._metric.evaluate(m, self.share))
         return self._last[1]
 
 
 @dataclass(frozen=True)
 class _Warped:
-    """m, gradient: (n,), (3, n) moving values and their gradients by u; stretch: dT/dx on the blocks, where asked."""
+    """gradient: (3, n) of the moving values by u; dissimilarity: of these values to the fixed ones."""
 
-    m: Array
     gradient: Array
-    similarity: Similarity
-    stretch: Array | None
+    dissimilarity: Dissimilarity
 
 
 def _mapped(prior: PointMap, samples: Samples) -> Array:

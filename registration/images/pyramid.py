@@ -6,14 +6,38 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from registration.nearby import bounding_box
-from registration.resample import coarsen, coarsen_mask
-from registration.similarity import Samples
-from registration.volume import Array, Mask, Volume
+from registration.images.morphology import bounding_box
+from registration.images.resample import coarsen, coarsen_mask
+from registration.volume import Array, Grid, Mask, Volume
+
+BLOCK = 2
+"""Edge in voxels of the blocks on which the gradient of a map is looked at."""
 
 
 @dataclass(frozen=True)
-class Images:
+class Samples:
+    """Voxels of the fixed image where images are compared. index: (n,) flat voxel indices on grid."""
+
+    grid: Grid
+    index: Array
+
+    def points(self) -> Array:
+        """Their centres, (n, 3), RAS mm."""
+        return self.grid.to_ras(np.stack(np.unravel_index(self.index, self.grid.shape), axis=1).astype(float))
+
+    def blocks(self, edge: int = BLOCK) -> tuple[Grid, Array]:
+        """Grid of blocks of edge^3 voxels, and the flat index (n,) of each sample's block."""
+        size = tuple(-(-n // edge) for n in self.grid.shape)
+        affine = self.grid.ras_from_ijk.copy()
+        affine[:3, :3] *= edge
+        affine[:3, 3] = self.grid.to_ras(np.full(3, (edge - 1) / 2))
+        i, j, k = np.unravel_index(self.index, self.grid.shape)
+        grid = Grid((size[0], size[1], size[2]), affine)
+        return grid, np.ravel_multi_index((i // edge, j // edge, k // edge), grid.shape)
+
+
+@dataclass(frozen=True)
+class PyramidLevel:
     """One level: fixed values (n,) at the samples, the moving image, and where that sees, in [0, 1]."""
 
     samples: Samples
@@ -41,7 +65,7 @@ class Pyramid:
             moving = Volume(np.where(seen, moving.hu - self._level, np.float32(0)), moving.ras_from_ijk)
         self._moving = coarsen(moving, finest_mm)
 
-    def at(self, voxel_mm: float) -> Images:
+    def at(self, voxel_mm: float) -> PyramidLevel:
         """The pair with voxels of `voxel_mm`."""
         fixed, inside, moving = (coarsen(v, voxel_mm) for v in (self._fixed, self._inside, self._moving))
         index = np.flatnonzero(inside.hu >= 0.5)
@@ -50,7 +74,7 @@ class Pyramid:
             seen = coarsen(self._seen, voxel_mm)
             hu = moving.hu / np.maximum(seen.hu, np.float32(0.05)) + self._level
             moving = Volume(hu, moving.ras_from_ijk)
-        return Images(Samples(fixed.grid, index), fixed.hu.reshape(-1)[index], moving, seen)
+        return PyramidLevel(Samples(fixed.grid, index), fixed.hu.reshape(-1)[index], moving, seen)
 
 
 def cropped(fixed: Volume, mask: Mask, margin_mm: float = 8.0) -> tuple[Volume, Mask]:

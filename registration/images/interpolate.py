@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit, prange
 
+from registration.kernels.trilinear import lower, value, value_and_slope
 from registration.volume import Array, Grid
 
 THREADS_FROM = 30_000
 CHUNKS = 16
+
+
+class _Samples(NamedTuple):
+    """What `_warp` fills: values (n,) and gradients (3, n)."""
+
+    values: Array
+    gradient: Array
 
 
 @njit(cache=True, fastmath=True)
@@ -19,15 +29,8 @@ def _values(voxels, points, fill, out, start, stop):
         if not (0.0 <= x <= ni - 1 and 0.0 <= y <= nj - 1 and 0.0 <= z <= nk - 1):
             out[n] = fill
             continue
-        i, j, k = min(int(x), ni - 2), min(int(y), nj - 2), min(int(z), nk - 2)
-        a, b, c = x - i, y - j, z - k
-        lower = (voxels[i, j, k] * (1 - c) + voxels[i, j, k + 1] * c) * (1 - b) + (
-            voxels[i, j + 1, k] * (1 - c) + voxels[i, j + 1, k + 1] * c
-        ) * b
-        upper = (voxels[i + 1, j, k] * (1 - c) + voxels[i + 1, j, k + 1] * c) * (1 - b) + (
-            voxels[i + 1, j + 1, k] * (1 - c) + voxels[i + 1, j + 1, k + 1] * c
-        ) * b
-        out[n] = lower * (1 - a) + upper * a
+        i, j, k = lower(x, ni), lower(y, nj), lower(z, nk)
+        out[n] = value(voxels, i, j, k, x - i, y - j, z - k)
 
 
 @njit(cache=True, parallel=True)
@@ -38,7 +41,7 @@ def _values_threads(voxels, points, fill, out):
 
 
 @njit(cache=True, fastmath=True)
-def _warp(voxels, base, displacement, index, ijk_from_ras, out, gradient, start, stop):
+def _warp(voxels, base, displacement, index, ijk_from_ras, out, start, stop):
     ni, nj, nk = voxels.shape
     for n in range(start, stop):
         u0, u1, u2 = displacement[0, index[n]], displacement[1, index[n]], displacement[2, index[n]]
@@ -49,31 +52,18 @@ def _warp(voxels, base, displacement, index, ijk_from_ras, out, gradient, start,
         sy = 1.0 if 0.0 <= y <= nj - 1 else 0.0
         sz = 1.0 if 0.0 <= z <= nk - 1 else 0.0
         x, y, z = min(max(x, 0.0), ni - 1.0), min(max(y, 0.0), nj - 1.0), min(max(z, 0.0), nk - 1.0)
-        i, j, k = min(int(x), ni - 2), min(int(y), nj - 2), min(int(z), nk - 2)
-        a, b, c = x - i, y - j, z - k
-        v000, v001 = voxels[i, j, k], voxels[i, j, k + 1]
-        v010, v011 = voxels[i, j + 1, k], voxels[i, j + 1, k + 1]
-        v100, v101 = voxels[i + 1, j, k], voxels[i + 1, j, k + 1]
-        v110, v111 = voxels[i + 1, j + 1, k], voxels[i + 1, j + 1, k + 1]
-        v00, v01 = v000 * (1 - c) + v001 * c, v010 * (1 - c) + v011 * c
-        v10, v11 = v100 * (1 - c) + v101 * c, v110 * (1 - c) + v111 * c
-        v0, v1 = v00 * (1 - b) + v01 * b, v10 * (1 - b) + v11 * b
-        out[n] = v0 * (1 - a) + v1 * a
-        dx = sx * (v1 - v0)
-        dy = sy * ((v01 - v00) * (1 - a) + (v11 - v10) * a)
-        dz = sz * (
-            ((v001 - v000) * (1 - b) + (v011 - v010) * b) * (1 - a) + ((v101 - v100) * (1 - b) + (v111 - v110) * b) * a
-        )
+        i, j, k = lower(x, ni), lower(y, nj), lower(z, nk)
+        out.values[n], dx, dy, dz = value_and_slope(voxels, i, j, k, x - i, y - j, z - k)
+        dx, dy, dz = sx * dx, sy * dy, sz * dz
         for m in range(3):
-            gradient[m, n] = ijk_from_ras[0, m] * dx + ijk_from_ras[1, m] * dy + ijk_from_ras[2, m] * dz
+            out.gradient[m, n] = ijk_from_ras[0, m] * dx + ijk_from_ras[1, m] * dy + ijk_from_ras[2, m] * dz
 
 
 @njit(cache=True, parallel=True)
-def _warp_threads(voxels, base, displacement, index, ijk_from_ras, out, gradient):
+def _warp_threads(voxels, base, displacement, index, ijk_from_ras, out):
     n = base.shape[0]
     for c in prange(CHUNKS):
-        start, stop = n * c // CHUNKS, n * (c + 1) // CHUNKS
-        _warp(voxels, base, displacement, index, ijk_from_ras, out, gradient, start, stop)
+        _warp(voxels, base, displacement, index, ijk_from_ras, out, n * c // CHUNKS, n * (c + 1) // CHUNKS)
 
 
 def warp_samples(
@@ -85,12 +75,12 @@ def warp_samples(
     Beyond the image its nearest value holds, so its gradient is zero there.
     """
     n = len(base)
-    out, gradient = np.empty(n, dtype=displacement.dtype), np.empty((3, n), dtype=displacement.dtype)
+    out = _Samples(np.empty(n, dtype=displacement.dtype), np.empty((3, n), dtype=displacement.dtype))
     if n > THREADS_FROM:
-        _warp_threads(voxels, base, displacement, index, ijk_from_ras, out, gradient)
+        _warp_threads(voxels, base, displacement, index, ijk_from_ras, out)
     else:
-        _warp(voxels, base, displacement, index, ijk_from_ras, out, gradient, 0, n)
-    return out, gradient
+        _warp(voxels, base, displacement, index, ijk_from_ras, out, 0, n)
+    return out.values, out.gradient
 
 
 def _checked(voxels: Array) -> Array:
