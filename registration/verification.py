@@ -13,10 +13,10 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from registration.blobs import blobs
-from registration.matching import alike
-from registration.rigid import RigidTransform
-from registration.selfsimilarity import BLOCK_RADIUS, describe, find_similar
+from registration.keypoints.blobs import blobs
+from registration.keypoints.matching import moves_with_neighbours
+from registration.keypoints.self_similarity import BLOCK_RADIUS, describe, find_similar
+from registration.maps.rigid import RigidTransform
 from registration.volume import Array, Grid, Mask, Volume
 
 
@@ -85,8 +85,8 @@ def left_over(
     """What is left of a motion between two images on one grid of cubic voxels.
 
     region: where blobs of the fixed image are looked for; allowed: where the moving image can be believed. A blob is
-    recognized if its block looks clearly more alike there than elsewhere, leads back to where it came from and moves as
-    those about it do. Raises ValueError for images on different grids.
+    recognized if its block looks clearly more similar there than elsewhere, leads back to where it came from and moves
+    as those about it do. Raises ValueError for images on different grids.
     """
     settings = settings or VerifySettings()
     if not all(fixed.grid.same_as(other.grid) for other in (moving, region, allowed)):
@@ -105,7 +105,7 @@ def left_over(
     kept = found.is_inner & (found.cost < settings.most_ratio * found.runner_up) & (trip <= settings.round_trip_mm)
     points = fixed.grid.to_ras(starts[kept].astype(float))
     vectors = found.shift[kept] @ fixed.grid.ras_from_ijk[:3, :3].T
-    agree = alike(points, vectors, settings.neighbours, settings.stray_mm)
+    agree = moves_with_neighbours(points, vectors, settings.neighbours, settings.stray_mm)
     return LeftOver(points[agree], vectors[agree], len(starts))
 
 

@@ -1,4 +1,4 @@
-"""Correspondences are believed for a reason: votes of the nearest places, the way there and back, alike motion."""
+"""Correspondences are believed for a reason: votes of the nearest places, the way there and back, moves_with_neighbours motion."""
 
 from __future__ import annotations
 
@@ -9,13 +9,21 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from registration import growing
-from registration.growing import GrowSettings, _best_of_each, _guesses, grow, local_maps, seconded
-from registration.matching import MatchSettings, Pairs, alike, match_keypoints
-from registration.turned import Found, Inside, find_turned
+from registration.correspondences import Correspondences
+from registration.keypoints.affine_matching import BlockMatches, MaskedImage, match_affine_blocks
+from registration.keypoints.matching import MatchSettings, match_keypoints, moves_with_neighbours
+from registration.keypoints.propagation import (
+    PropagationSettings,
+    _best_of_each,
+    _guesses,
+    has_consensus,
+    local_affines,
+    propagate_matches,
+)
 from registration.volume import Array, Mask, Volume
 from tests.registration.scenes import image_of, make_pattern, oriented
 
-SETTINGS = GrowSettings(MatchSettings())
+SETTINGS = PropagationSettings(MatchSettings())
 TURN = np.array([[0.8, -0.6, 0.0], [0.6, 0.8, 0.0], [0.0, 0.0, 1.0]])
 SHIFT = np.array([9.0, -4.0, 2.0])
 GRID = oriented("LPS", (40, 38, 36), 2.0, np.array([10.0, -20.0, 30.0]))
@@ -41,45 +49,45 @@ def test_a_new_place_needs_two_of_its_eight_nearest(votes: int, believed: bool) 
     first = turned(x)
     first[votes:] += [0.0, 0.0, 40.0]  # these expect it elsewhere
     farther = ring(5, 14.0, seed=1)  # these would second it, but are not asked
-    pairs = Pairs(np.concatenate([first, turned(farther)]), np.concatenate([x, farther]), np.ones(13))
+    pairs = Correspondences.of(np.concatenate([x, farther]), np.concatenate([first, turned(farther)]))
     maps = np.tile(TURN, (13, 1, 1))
-    new = Pairs(turned(MIDDLE[None]), MIDDLE[None], np.ones(1))
-    assert seconded(new, pairs, maps, SETTINGS).tolist() == [believed]
+    new = Correspondences.of(MIDDLE[None], turned(MIDDLE[None]))
+    assert has_consensus(new, pairs, maps, SETTINGS).tolist() == [believed]
 
 
 def test_a_vote_is_a_guess_within_five_millimetres_turned_as_its_place_is() -> None:
     x = ring(8, 10.0)
-    pairs, maps = Pairs(turned(x), x, np.ones(8)), np.tile(TURN, (8, 1, 1))
+    pairs, maps = Correspondences.of(x, turned(x)), np.tile(TURN, (8, 1, 1))
     at = np.tile(MIDDLE, (2, 1))
-    off = Pairs(turned(at) + np.array([[0, 4.9, 0], [0, 5.1, 0]]), at, np.ones(2))
-    assert seconded(off, pairs, maps, SETTINGS).tolist() == [True, False]
+    off = Correspondences.of(at, turned(at) + np.array([[0, 4.9, 0], [0, 5.1, 0]]))
+    assert has_consensus(off, pairs, maps, SETTINGS).tolist() == [True, False]
     aside = np.tile(MIDDLE + np.array([6.0, 0, 0]), (1, 1))
-    assert seconded(Pairs(turned(aside), aside, np.ones(1)), pairs, maps, SETTINGS).tolist() == [True]
+    assert has_consensus(Correspondences.of(aside, turned(aside)), pairs, maps, SETTINGS).tolist() == [True]
     straight = np.tile(np.eye(3), (8, 1, 1))  # maps that do not know the turn miss by up to 2 x 10 mm
     assert (np.linalg.norm(turned(at[:1]) - (turned(x) + MIDDLE - x), axis=1) > 5).sum() > 6
-    assert seconded(Pairs(turned(at[:1]), at[:1], np.ones(1)), pairs, straight, SETTINGS).tolist() == [False]
+    assert has_consensus(Correspondences.of(at[:1], turned(at[:1])), pairs, straight, SETTINGS).tolist() == [False]
 
 
 def test_fewer_places_than_electors_are_all_asked() -> None:
     x = ring(3, 8.0)
-    pairs = Pairs(turned(x), x, np.ones(3))
-    new = Pairs(turned(MIDDLE[None]), MIDDLE[None], np.ones(1))
-    assert seconded(new, pairs, np.tile(TURN, (3, 1, 1)), SETTINGS).tolist() == [True]
+    pairs = Correspondences.of(x, turned(x))
+    new = Correspondences.of(MIDDLE[None], turned(MIDDLE[None]))
+    assert has_consensus(new, pairs, np.tile(TURN, (3, 1, 1)), SETTINGS).tolist() == [True]
 
 
 def test_one_that_moves_against_the_others_does_not_bend_their_gradients() -> None:
     x = MIDDLE + np.random.default_rng(3).uniform(-20, 20, (60, 3))
     first = turned(x)
     first[17] += [15.0, -10.0, 5.0]
-    maps = local_maps(Pairs(first, x, np.ones(60)), 12)
+    maps = local_affines(Correspondences.of(x, first), 12)
     others = np.arange(60) != 17
     assert np.abs(maps[others] - TURN).max() < 0.15
-    assert not alike(x, first - x, 10, 12.0)[17]
+    assert not moves_with_neighbours(x, first - x, 10, 12.0)[17]
 
 
 def test_a_guess_lies_where_its_guide_and_the_gradient_about_it_say_and_is_made_once() -> None:
     x = ring(6, 12.0, seed=4)
-    pairs = Pairs(turned(x), x, np.ones(6))
+    pairs = Correspondences.of(x, turned(x))
     maps, none = np.tile(TURN, (6, 1, 1)), np.zeros(0, np.int64)
     places = MIDDLE + np.array([[1.0, 2, -1], [5, 0, 0], [60, 0, 0], [0, 5, 0]])
     is_open = np.array([True, True, True, False])
@@ -88,7 +96,7 @@ def test_a_guess_lies_where_its_guide_and_the_gradient_about_it_say_and_is_made_
     assert_array_equal(guesses.place, [0, 1])
     assert_allclose(guesses.first, turned(places[:2]), atol=1e-9)
     assert_array_equal(guesses.guide, np.linalg.norm(places[:2, None] - x, axis=2).argmin(axis=1))
-    pairs.first[guesses.guide[0]] += [0, 0, 30.0]  # now that guide differs, and another one speaks beside it
+    pairs.moving[guesses.guide[0]] += [0, 0, 30.0]  # now that guide differs, and another one speaks beside it
     more, _ = _guesses(places[:1], is_open[:1], pairs, maps, none, SETTINGS)
     assert len(more.place) == 2
     assert_allclose(sorted(more.first[:, 2] - turned(places[:1])[0, 2]), [0, 30.0], atol=1e-9)
@@ -102,7 +110,7 @@ def test_of_several_guesses_for_a_place_the_best_correlation_counts() -> None:
 
 
 class Blocks:
-    """Stands in for `find_turned`: every block is found one voxel along each axis from its guess."""
+    """Stands in for `match_affine_blocks`: every block is found one voxel along each axis from its guess."""
 
     shift = np.array([1.0, 1.0, 1.0])
 
@@ -110,10 +118,10 @@ class Blocks:
         self.ncc, self.stray = ncc, stray
         self.calls: list[tuple[Any, ...]] = []
 
-    def __call__(self, *values: Any) -> Found:
+    def __call__(self, *values: Any) -> BlockMatches:
         self.calls.append(values)
         count = len(values[2])
-        return Found(np.tile(self.shift, (count, 1)), np.full(count, self.ncc), np.full(count, self.stray))
+        return BlockMatches(np.tile(self.shift, (count, 1)), np.full(count, self.ncc), np.full(count, self.stray))
 
 
 @pytest.mark.parametrize(
@@ -123,10 +131,10 @@ def test_a_block_that_correlates_too_little_or_does_not_lead_back_is_no_place(
     monkeypatch: pytest.MonkeyPatch, ncc: float, stray: float, grows: bool
 ) -> None:
     known = Blocks(ncc, stray)
-    monkeypatch.setattr(growing, "find_turned", known)
+    monkeypatch.setattr(growing, "match_affine_blocks", known)
     x = MIDDLE + np.random.default_rng(5).uniform(-15, 15, (20, 3))
     first, second = image_of(PATTERN, GRID), image_of(PATTERN, GRID)
-    pairs = grow(first, second, EVERYWHERE, EVERYWHERE, Pairs(turned(x), x, np.ones(20)), SETTINGS)
+    pairs = propagate_matches(first, second, EVERYWHERE, EVERYWHERE, Correspondences.of(x, turned(x)), SETTINGS)
     assert (len(pairs) > 20) is grows
     new = pairs.only(np.arange(20, len(pairs)))
     if not grows:
@@ -149,7 +157,9 @@ def test_a_wrong_match_among_right_ones_stays_alone(moved: Volume) -> None:
     x = MIDDLE + np.random.default_rng(6).uniform([-16, -16, -16], [16, 16, 16], (30, 3))
     first = turned(x)
     first[11] += [-14.0, 9.0, 12.0]
-    pairs = grow(moved, image_of(PATTERN, GRID), EVERYWHERE, EVERYWHERE, Pairs(first, x, np.ones(30)), SETTINGS)
+    pairs = propagate_matches(
+        moved, image_of(PATTERN, GRID), EVERYWHERE, EVERYWHERE, Correspondences.of(x, first), SETTINGS
+    )
     new = pairs.only(np.arange(30, len(pairs)))
     assert len(new) > 10
     assert np.linalg.norm(new.first - turned(new.second), axis=1).max() < 2.0
@@ -166,9 +176,9 @@ def test_a_block_found_by_chance_does_not_lead_back() -> None:
     whole = np.ones(GRID.shape, bool)
     maps = np.concatenate([np.eye(3), start[0][:, None]], axis=1)[None].astype(float)
     blended = 0.6 * second.hu + 0.4 * np.roll(second.hu, tuple(-aside), (0, 1, 2))
-    found = find_turned(
-        Inside(np.where(np.abs(np.indices(GRID.shape).T - here).max(axis=3).T <= 3, blended, second.hu), whole),
-        Inside(lonely.astype(np.float32), whole),
+    found = match_affine_blocks(
+        MaskedImage(np.where(np.abs(np.indices(GRID.shape).T - here).max(axis=3).T <= 3, blended, second.hu), whole),
+        MaskedImage(lonely.astype(np.float32), whole),
         start,
         maps,
         3,
@@ -185,8 +195,8 @@ def test_matches_say_where_the_first_image_shows_a_place_of_the_second() -> None
     first = image_of(lambda points: PATTERN(points - shift), GRID)
     pairs = match_keypoints(first, second, EVERYWHERE)
     assert len(pairs) > 30
-    assert_allclose(np.median(pairs.first - pairs.second, axis=0), shift, atol=0.2)
-    assert np.linalg.norm(pairs.first - pairs.second - shift, axis=1).max() < MatchSettings().stray_mm
+    assert_allclose(np.median(pairs.moving - pairs.fixed, axis=0), shift, atol=0.2)
+    assert np.linalg.norm(pairs.moving - pairs.fixed - shift, axis=1).max() < MatchSettings().stray_mm
     assert (pairs.ncc >= MatchSettings().least_ncc).all()
     back = match_keypoints(second, first, EVERYWHERE)
     assert_allclose(np.median(back.first - back.second, axis=0), -shift, atol=0.2)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from registration.blobs import blobs
-from registration.rigid import RigidTransform
-from registration.selfsimilarity import describe, find_similar
+from registration.keypoints.blobs import blobs
+from registration.keypoints.self_similarity import describe, find_similar
+from registration.maps.rigid import RigidTransform
 from registration.verification import LeftOver, VerifySettings, left_over, rigid_between
 from registration.volume import Array, Grid, Mask, Volume
 from tests.registration.scenes import image_of, make_pattern, oriented

@@ -11,7 +11,7 @@ from functools import lru_cache
 import numpy as np
 
 from poro.mesh import TetMesh, stuff_level_set
-from registration.rigid import RigidTransform
+from registration.maps.rigid import RigidTransform
 from registration.spine import RigidFit, RigidStatus
 from registration.volume import Array, Grid, Mask, Volume
 from tests.registration.scenes import make_pattern

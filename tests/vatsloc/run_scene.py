@@ -23,12 +23,12 @@ from poro.flow import Flow
 from poro.mesh import TetMesh, stuff_level_set
 from poro.model import PoroState, PoroStatus, Theta
 from poro.tissue import Tissue
+from registration.correspondences import Correspondences
 from registration.ffd import FfdFit
-from registration.inversion import Inversion
-from registration.matching import Pairs
-from registration.newton import Stop
-from registration.rigid import RigidTransform
+from registration.maps.inversion import Inversion
+from registration.maps.rigid import RigidTransform
 from registration.spine import RigidFit, RigidStatus
+from registration.terms.gauss_newton import Stop
 from registration.volume import Array, Grid, Mask, Volume
 from vatsloc.case import Case, Hints, Nodule
 from vatsloc.imaging.cbct import Cupping, FieldOfView, PreparedCbct
@@ -270,7 +270,7 @@ def _collapse(lung: TetMesh) -> Collapse:
         hilum_nodes=np.array([2, 3]),
         motion=HilumMotion(np.array([[1.0, 2, 3], [3.0, 6, 5]]), HilumSource.AIRWAYS),
     )
-    found_again, others = Pairs(nothing, nothing, np.zeros(0)), np.zeros((0, *model_mesh.points.shape))
+    found_again, others = Correspondences.of(nothing, nothing), np.zeros((0, *model_mesh.points.shape))
     still = np.zeros_like(model_mesh.points)
     model = Model(system, _fit(model_mesh), still, found_again, (), solid, others)
     return Collapse(observed, model, None, after.points)

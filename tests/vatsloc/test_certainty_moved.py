@@ -9,7 +9,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from poro.fit import ellipsoid95, point_covariance
-from registration.matching import Pairs
+from registration.correspondences import Correspondences
 from registration.volume import Array
 from tests.vatsloc import run_scene as known
 from vatsloc.evaluation.ellipsoid import in_ellipsoid
@@ -33,7 +33,7 @@ def with_places() -> known.Scene:
     first = known.DEF_FROM_INF_RIGID(known.INF_FROM_CT(known.CENTRE + np.outer(np.arange(8.0) - 4.0, [5.0, 0, 0])))
     towards = np.tile([[0.6, 0.0, 0.8], [0.0, -1.0, 0.0]], (4, 1))
     second = known.AFTER_FROM_BEFORE(first) + 0.01 * MISSED[:, None] * towards
-    return known.scene().with_model(pairs=Pairs(first, second, np.ones(8)), rungs=TRIED)
+    return known.scene().with_model(pairs=Correspondences.of(second, first), rungs=TRIED)
 
 
 def test_without_images_the_model_counts_where_the_spine_puts_a_point() -> None:
@@ -70,7 +70,7 @@ def test_where_registrations_placed_tissue_they_count_node_by_node() -> None:
 
 def test_nearest_places_are_those_of_the_deflated_image() -> None:
     collapse = with_places().collapse
-    places = collapse.model.pairs.second
+    places = collapse.model.pairs.fixed
     distance, missed = nearest_places(collapse, places[[0, 7]] + [0, 0, 1e-3])
     assert_allclose(distance, 1e-3, atol=1e-9)
     assert_allclose(missed, [0.01 * MISSED[:6].mean(), 0.01 * MISSED[2:].mean()], rtol=1e-6)
@@ -79,7 +79,7 @@ def test_nearest_places_are_those_of_the_deflated_image() -> None:
 def test_places_are_measured_from_where_the_answer_puts_a_point() -> None:
     scene = with_places()
     got = sure(scene, CT)
-    second, after = scene.collapse.model.pairs.second, known.DEF_FROM_CT(CT)
+    second, after = scene.collapse.model.pairs.fixed, known.DEF_FROM_CT(CT)
     for point, before, one in zip(after, BEFORE, got, strict=True):
         far = np.linalg.norm(second - point, axis=1)
         missed = 0.01 * MISSED[np.argsort(far)[:6]].mean()

@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from poro.mesh import TetMesh, stuff_level_set
-from registration.rigid import RigidTransform
+from registration.maps.rigid import RigidTransform
 from registration.verification import LeftOver
 from registration.volume import Array, Mask, Volume
 from tests.registration.scenes import image_of, make_pattern, oriented

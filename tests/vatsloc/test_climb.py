@@ -17,7 +17,7 @@ from poro.mesh import TetMesh
 from poro.model import PoroStatus, Theta
 from poro.observations import Target
 from poro.tissue import Tissue
-from registration.matching import Pairs
+from registration.correspondences import Correspondences
 from registration.volume import Array
 from tests.vatsloc import ball_scene as scene
 from vatsloc.imaging.surface import Border, SurfacePoints
@@ -53,11 +53,11 @@ def motion(points: Array) -> Array:
     return np.asarray(scene.collapsed(points) - points)
 
 
-def pairs_of(count: int = 400, seed: int = 5) -> Pairs:
+def pairs_of(count: int = 400, seed: int = 5) -> Correspondences:
     """Places that move by the scene's collapse."""
     x = scene.CENTRE_DEF + np.random.default_rng(seed).uniform(-19, 19, (count, 3))
     # Far enough from each other that some blocks of 40 mm are held back and others are not.
-    return Pairs(x, scene.collapsed(x), np.ones(count))
+    return Correspondences.of(scene.collapsed(x), x)
 
 
 def a_fit(displacement: Array, settled: bool = True, tets: int = 1, inverted: float = 0.0) -> Any:
@@ -77,7 +77,7 @@ class _Fit:
     status: FitStatus = FitStatus.CONVERGED
 
 
-def a_model(share: float = 0.0, pairs: Pairs | None = None, rungs: tuple[Rung, ...] = ()) -> Model:
+def a_model(share: float = 0.0, pairs: Correspondences | None = None, rungs: tuple[Rung, ...] = ()) -> Model:
     """A model that knows a share of the collapse."""
     lung: Any = mesh()
     system: Any = SimpleNamespace(mesh=lung, gravity=GRAVITY, hilum=HILUM, tissue=None)
@@ -113,15 +113,15 @@ def test_held_back_places_are_never_shown_to_the_model_that_is_judged_by_them() 
     u, surface = start.displacement, a_surface()
     blind = replace(start, displacement=0.5 * u, fit=a_fit(u))
     model, trained = best_of({"step": watched}, start, blind, surface)
-    hidden = held_back(start.pairs.second)
+    hidden = held_back(start.pairs.fixed)
     assert 10 < hidden.sum() < len(hidden) - 10
     (one, few, from_one), (other, every, from_other) = shown
     assert (one, other) == (blind, start)
-    assert_array_equal(few.inflated, start.pairs.first[~hidden])
-    assert_array_equal(few.deflated, start.pairs.second[~hidden])
+    assert_array_equal(few.inflated, start.pairs.moving[~hidden])
+    assert_array_equal(few.deflated, start.pairs.fixed[~hidden])
     assert_array_equal(few.keypoint_weights, np.ones((~hidden).sum()))
-    assert_array_equal(every.inflated, start.pairs.first)
-    assert_array_equal(every.deflated, start.pairs.second)
+    assert_array_equal(every.inflated, start.pairs.moving)
+    assert_array_equal(every.deflated, start.pairs.fixed)
     for target in (few, every):
         assert_array_equal(target.points, surface.points)
         assert_array_equal(target.normals, surface.normals)
@@ -130,7 +130,7 @@ def test_held_back_places_are_never_shown_to_the_model_that_is_judged_by_them() 
     assert_allclose(trained.displacement, 0.8 * motion(start.system.mesh.points))
     assert_allclose(model.displacement, 0.9 * motion(start.system.mesh.points))
     (rung,) = model.rungs
-    whole = np.linalg.norm(start.pairs.second - start.pairs.first, axis=1)[hidden]
+    whole = np.linalg.norm(start.pairs.fixed - start.pairs.moving, axis=1)[hidden]
     assert rung.before_mm == pytest.approx(0.9 * np.median(whole), rel=0.05)  # the blind model knows 0.1 of it
     assert rung.after_mm == pytest.approx(0.2 * np.median(whole), rel=0.05)
     assert rung.kept
@@ -281,7 +281,7 @@ def test_the_regional_fit_sets_stretches_and_hilum_free_and_starts_where_it_is_t
 class Climb:
     """`climb` with a plain fit that knows 20 % of the collapse, and corrections that know all of it when shown all."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, pairs: Pairs) -> None:
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, pairs: Correspondences) -> None:
         lung = mesh()
         self.plain = a_fit(0.1 * motion(lung.points))
         self.solid = a_fit(0.2 * motion(lung.points)).state
@@ -365,7 +365,7 @@ def test_places_are_looked_for_where_the_strain_measure_that_holds_puts_them(mon
     ],
 )
 def test_without_a_rung_the_plain_answer_stands_and_other_answers_say_how_sure_it_is(
-    monkeypatch: pytest.MonkeyPatch, pairs: Pairs, tables: dict[str, Any], skipped: dict[str, str]
+    monkeypatch: pytest.MonkeyPatch, pairs: Correspondences, tables: dict[str, Any], skipped: dict[str, str]
 ) -> None:
     known = Climb(monkeypatch, pairs)
     model = known.run(**tables)

@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from poro.mesh import TetMesh
-from registration.field import sample_map
+from registration.maps.field import sample_map
 from registration.volume import Array, Grid, Mask
 from tests.vatsloc import run_scene as known
 from vatsloc.case import Landmarks

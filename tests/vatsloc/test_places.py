@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from registration.matching import Pairs
+from registration.correspondences import Correspondences
 from registration.volume import Array
 from tests.vatsloc import ball_scene as scene
 from vatsloc.maps import MeshMap
@@ -48,12 +48,12 @@ def test_places_lie_before_the_collapse_where_the_spine_puts_them_and_after_it_w
     model = 0.6 * (scene.collapsed(observed.model_mesh.points) - observed.model_mesh.points)
     pairs = inner_pairs(half_seen(), observed, model, KeypointSettings(reach_mm=8.0))
     assert len(pairs) > 70
-    error = np.linalg.norm(scene.collapsed(pairs.first) - pairs.second, axis=1)
+    error = np.linalg.norm(scene.collapsed(pairs.moving) - pairs.fixed, axis=1)
     assert np.median(error) < 0.8
     assert np.percentile(error, 95) < 2.0
-    assert depth_before(pairs.first).min() > 0
-    assert scene.DEF_FROM_INF.inverse()(pairs.first)[:, 0].max() < PLANE_INF + 2.5
-    assert pairs.second[:, 2].max() < PLANE_DEF + 2.5
+    assert depth_before(pairs.moving).min() > 0
+    assert scene.DEF_FROM_INF.inverse()(pairs.moving)[:, 0].max() < PLANE_INF + 2.5
+    assert pairs.fixed[:, 2].max() < PLANE_DEF + 2.5
 
 
 def test_spreading_gets_both_images_in_one_frame_and_the_lung_of_each(
@@ -65,11 +65,13 @@ def test_spreading_gets_both_images_in_one_frame_and_the_lung_of_each(
     matched: dict[str, Any] = {}
     grown: dict[str, Any] = {}
 
-    def match(first: Any, other: Any, region: Any, settings: Any, first_region: Any) -> Pairs:
+    def match(first: Any, other: Any, region: Any, settings: Any, first_region: Any) -> Correspondences:
         matched.update(first=first, second=other, region=region, settings=settings, first_region=first_region)
-        return Pairs(warped, second, np.linspace(0.7, 0.9, 30))
+        return Correspondences.of(second, warped, ncc=np.linspace(0.7, 0.9, 30))
 
-    def spread(first: Any, other: Any, before: Any, after: Any, pairs: Pairs, settings: Any) -> Pairs:
+    def spread(
+        first: Any, other: Any, before: Any, after: Any, pairs: Correspondences, settings: Any
+    ) -> Correspondences:
         grown.update(first=first, second=other, before=before, after=after, settings=settings)
         return pairs
 
@@ -79,8 +81,8 @@ def test_spreading_gets_both_images_in_one_frame_and_the_lung_of_each(
     # The model takes 60 % of an affine collapse: its inverse is affine too.
     gradient = np.eye(3) + 0.6 * (scene.SQUEEZE - np.eye(3))
     before = scene.CENTRE_DEF + (warped - scene.CENTRE_DEF - 0.6 * scene.SHIFT_MM) @ np.linalg.inv(gradient).T
-    assert_allclose(pairs.first, before, atol=1e-6)
-    assert_allclose(pairs.second, second)
+    assert_allclose(pairs.moving, before, atol=1e-6)
+    assert_allclose(pairs.fixed, second)
     assert_allclose(pairs.ncc, np.linspace(0.7, 0.9, 30))
     assert matched["settings"].voxel_mm == 2.0
     assert matched["settings"].reach_mm == 9.0

@@ -11,7 +11,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from poro.mesh import TetMesh
-from registration.matching import Pairs
+from registration.correspondences import Correspondences
 from registration.volume import Array
 from tests.vatsloc import ball_scene as scene
 from vatsloc.workflow import pneumothorax as module
@@ -54,7 +54,7 @@ class Parts:
             surface=scene.air_surface(40),
         )
         places = scene.CENTRE_DEF + np.random.default_rng(7).uniform(-20, 20, (9, 3))
-        self.pairs = Pairs(places, scene.collapsed(places), np.linspace(0.6, 1, 9))
+        self.pairs = Correspondences.of(scene.collapsed(places), places, ncc=np.linspace(0.6, 1, 9))
         system: Any = SimpleNamespace(mesh=coarse)
         nothing: Any = None
         moved = scene.collapsed(coarse.points) - coarse.points
@@ -109,10 +109,10 @@ def test_the_residual_registration_is_asked_in_the_frames_of_the_scans(monkeypat
     assert before is parts.before
     assert surface is parts.observed.surface
     assert settings == settings_of("balanced").residual
-    assert_allclose(scene.DEF_FROM_INF(pairs.first), parts.pairs.first)
-    assert_array_equal(pairs.second, parts.pairs.second)
+    assert_allclose(scene.DEF_FROM_INF(pairs.moving), parts.pairs.moving)
+    assert_array_equal(pairs.fixed, parts.pairs.fixed)
     assert_array_equal(pairs.ncc, parts.pairs.ncc)
-    assert_allclose(model(pairs.first), pairs.second, atol=1e-6)
+    assert_allclose(model(pairs.moving), pairs.fixed, atol=1e-6)
     far = np.array([[300.0, -200.0, 100.0]])
     assert np.linalg.norm(model(far) - scene.DEF_FROM_INF(far)) < 20.0  # the rigid part is that of the spines
     assert_array_equal(model.mesh.points, parts.inflated.points)

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from registration.inversion import Inversion, invert_at
-from registration.penalties import Keypoints
+from registration.correspondences import Correspondences
+from registration.maps.inversion import Inversion, invert_at
 from registration.volume import Array, Mask
 from tests.vatsloc import ball_scene as scene
 from vatsloc.errors import InputRefused
@@ -109,7 +109,7 @@ def test_the_lung_is_registered_inflated_to_ct_from_the_spines_pose(watched: Wat
     assert named["seen"] is watched.prepared.inflated.field.usable
     assert_allclose(named["prior"].matrix, CT_FROM_INF.matrix)
     places = scene.CENTRE_INF + np.random.default_rng(1).uniform(-20, 20, (50, 3))
-    still = Keypoints(places, CT_FROM_INF(places), np.ones(50))
+    still = Correspondences(places, CT_FROM_INF(places), np.ones(50))
     assert named["is_far"](still)  # 0 mm, but balanced keeps the first registration in every case
     assert [(choice.part, choice.limit) for choice in watched.stages.choices if choice.part == FIRST] == [(FIRST, -1.0)]
     assert watched.stages.choices[-1].value == pytest.approx(0.0, abs=1e-9)
@@ -247,7 +247,7 @@ def test_places_are_far_where_95_percent_moved_by_more_than_the_limit_against_th
     fixed = np.random.default_rng(2).uniform(-30, 30, (100, 3))
     off = np.where(np.arange(100) < 90, 10.0, 0.0)
     off[:4] = 500.0  # fewer than 5 %
-    places = Keypoints(fixed, CT_FROM_INF(fixed) + off[:, None] * np.array([0, 0, 1.0]), np.ones(100))
+    places = Correspondences(fixed, CT_FROM_INF(fixed) + off[:, None] * np.array([0, 0, 1.0]), np.ones(100))
     stages = Stages()
     assert is_far(CT_FROM_INF, limit, stages, places) is far
     (choice,) = stages.choices

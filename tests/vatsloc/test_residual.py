@@ -11,7 +11,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from poro.mesh import TetMesh
-from registration.matching import Pairs
+from registration.correspondences import Correspondences
 from registration.volume import Array, Mask
 from tests.vatsloc import ball_scene as scene
 from vatsloc.imaging.surface import Border, SurfacePoints
@@ -20,7 +20,7 @@ from vatsloc.workflow import residual
 from vatsloc.workflow.residual import Residual, _border_offsets, residual_registration
 from vatsloc.workflow.settings import ResidualSettings
 
-NO_PAIRS = Pairs(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
+NO_PAIRS = Correspondences.of(np.zeros((0, 3)), np.zeros((0, 3)))
 NO_SURFACE = SurfacePoints(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0, dtype=np.int8))
 COARSE = ResidualSettings(voxel_mm=4.0, grid_mm=24.0, levels=1)
 FINE = ResidualSettings(levels=1)
@@ -56,7 +56,7 @@ def run(
     monkeypatch: pytest.MonkeyPatch,
     registration: Registration,
     surface: SurfacePoints = NO_SURFACE,
-    pairs: Pairs = NO_PAIRS,
+    pairs: Correspondences = NO_PAIRS,
     lung: Mask | None = None,
     settings: ResidualSettings = COARSE,
     **usable: Array,
@@ -141,7 +141,7 @@ def test_each_registration_gets_its_own_images_region_and_keypoints(monkeypatch:
     first = scene.CENTRE_INF + np.random.default_rng(3).uniform(-20, 20, (12, 3))
     second = scene.CENTRE_DEF + np.random.default_rng(4).uniform(-20, 20, (12, 3))
     known = Registration(shifted(-OFF), two_valued(0.0, 0.0))
-    assert run(monkeypatch, known, pairs=Pairs(first, second, np.ones(12)), settings=FINE) is not None
+    assert run(monkeypatch, known, pairs=Correspondences.of(second, first), settings=FINE) is not None
     there, back = known.calls
     expected = Scene.model(first)
     assert_allclose(there["keypoints"].fixed, second)

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from registration.field import DisplacementField
-from registration.rigid import RigidTransform
+from registration.maps.field import DisplacementField
+from registration.maps.rigid import RigidTransform
 from registration.volume import Array, Grid, Mask, Volume, axis_codes
 from tests.vatsloc.run_scene import lps_grid
 from vatsloc import results

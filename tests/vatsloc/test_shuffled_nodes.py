@@ -17,7 +17,7 @@ from poro.mesh import TetMesh, interpolate, locate
 from poro.model import Theta, assemble, sensitivity, solve
 from poro.observations import Target
 from poro.tissue import Tissue
-from registration.matching import Pairs
+from registration.correspondences import Correspondences
 from registration.volume import Array
 from tests.vatsloc import ball_scene as scene
 from vatsloc.formats.meshes import TetraMesh, read_vtu, write_vtu
@@ -139,7 +139,7 @@ def test_a_solved_and_a_fitted_lung_are_the_same() -> None:
 
 def test_misfits_are_alike_and_a_shuffled_displacement_shows() -> None:
     u = wavy(BALL.points)
-    pairs = Pairs(INNER, INNER + interpolate(locate(BALL, INNER), u), np.ones(len(INNER)))
+    pairs = Correspondences.of(INNER + interpolate(locate(BALL, INNER), u), INNER)
     assert misfit(BALL, u, pairs) == pytest.approx(0, abs=1e-9)
     assert misfit(SHUFFLED, u[ORDER], pairs) == pytest.approx(0, abs=1e-9)
     assert misfit(SHUFFLED, u, pairs) > 1.0

@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 
 from poro.mesh import TetMesh
-from registration.resample import coarsen, resample, resample_mask
+from registration.images.morphology import dilate, erode
+from registration.images.resample import coarsen, resample, resample_mask
 from registration.verification import LeftOver, left_over
 from registration.volume import Array, Mask, Volume
 from vatsloc.frames import flip_points
 from vatsloc.imaging.cbct import PreparedCbct
-from vatsloc.imaging.lattice import dilate, erode
 from vatsloc.maps import MeshMap, covered, sampled
 from vatsloc.workflow.certainty import CHECK_REACH_MM
 from vatsloc.workflow.gates import Gate, at_least, at_most

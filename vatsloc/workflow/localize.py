@@ -11,7 +11,7 @@ from poro.fit import FitStatus, ellipsoid95
 from poro.mesh import closest_points
 from poro.mesh.tetmesh import signed_volumes
 from poro.model import PoroStatus
-from registration.resample import coarsen
+from registration.images.resample import coarsen
 from registration.spine import RigidFit
 from registration.volume import Array, Mask
 from vatsloc.case import Case

@@ -13,7 +13,7 @@ from itertools import combinations
 import numpy as np
 from numba import njit, prange
 
-from registration.matching import between_voxels
+from registration.keypoints.matching import subvoxel_peak
 from registration.volume import Array
 
 STEP = 2
@@ -70,7 +70,7 @@ def find_similar(fixed: Array, moving: Array, allowed: Array, starts: Array, rea
     around = np.full((n, 27), NO_COST, np.float32)
     starts = np.ascontiguousarray(starts, np.int64)
     _search(fixed, moving, np.ascontiguousarray(allowed), starts, _BLOCK, reach, best, shift, around)
-    offset, is_top = between_voxels(-around / NO_COST)
+    offset, is_top = subvoxel_peak(-around / NO_COST)
     return Similar(shift + offset, best[:, 0], best[:, 1], is_top)
 
 
