@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.testing import assert_allclose
 
-from poro.anderson import DEPTH, Anderson
+from poro.linalg.anderson import DEPTH, Anderson
 
 
 def test_a_linear_map_of_few_rates_ends_in_as_many_steps() -> None:

@@ -7,14 +7,14 @@ import pytest
 from numpy.testing import assert_allclose
 from shapes import ellipsoid
 
-from poro.assembly import deformation_gradient
-from poro.choice import Model, Range, finite_problem, keep_in_range, solve_in_range
-from poro.finite import FiniteProblem, FiniteStatus, deform
-from poro.laws import neo_hookean
-from poro.model import PoroSystem, Theta, assemble, solve
-from poro.modes import hilum_modes
-from poro.solid import solid
-from poro.tissue import Tissue
+from poro.collapse.choice import Model, Range, finite_problem, keep_in_range, solve_in_range
+from poro.collapse.finite_strain import FiniteProblem, FiniteStatus, deform
+from poro.collapse.model import PoroSystem, Theta, assemble, solve
+from poro.collapse.modes import hilum_modes
+from poro.fem.constitutive import neo_hookean
+from poro.fem.forms import deformation_gradient
+from poro.fem.solid import solid
+from poro.fem.tissue import Tissue
 
 TISSUE = Tissue()
 LAW = neo_hookean(TISSUE)

@@ -8,14 +8,14 @@ from numpy.testing import assert_allclose
 from scipy.sparse import identity
 from shapes import compliance_of, ellipsoid
 
-import poro.compliance
-from poro.assembly import body_load, stiffness
-from poro.compliance import Compliance
-from poro.contact import ContactStatus, Obstacle, settle
-from poro.levelset import level_set
-from poro.solid import solid, unknowns_of
-from poro.solver import inverse_at, linear_solver
-from poro.tissue import GRAVITY_KPA_PER_MM, Tissue
+import poro.contact.compliance
+from poro.contact.active_set import ContactStatus, Obstacle, settle
+from poro.contact.compliance import Compliance
+from poro.contact.levelset import level_set
+from poro.fem.forms import body_load, stiffness
+from poro.fem.solid import solid, unknowns_of
+from poro.fem.tissue import GRAVITY_KPA_PER_MM, Tissue
+from poro.linalg.solver import inverse_at, linear_solver
 
 
 @pytest.mark.parametrize(("limit", "tolerance"), [(10**9, 1e-11), (0, 1e-8)])
@@ -45,7 +45,7 @@ def test_contact_in_single_precision_moves_nodes_by_less_than_a_micron(monkeypat
     free = body.solve(body_load(mesh, np.array([0.6, 0, -0.8]) * 200 * GRAVITY_KPA_PER_MM))[nodes]
     states = []
     for double in (10**6, 0):
-        monkeypatch.setattr(poro.compliance, "DOUBLE_UNKNOWNS", double)
+        monkeypatch.setattr(poro.contact.compliance, "DOUBLE_UNKNOWNS", double)
         compliance = compliance_of(body, nodes)
         states.append(settle(compliance, obstacle, free, 0.0, tolerance_mm=1e-6))
         assert compliance.matrix.dtype == (np.float64 if double else np.float32)
@@ -60,7 +60,7 @@ def test_contact_in_single_precision_moves_nodes_by_less_than_a_micron(monkeypat
 
 def test_means_over_groups_lose_nothing_to_single_precision(monkeypatch: pytest.MonkeyPatch) -> None:
     """Rounding in them would pull at the springs of a solution at rest."""
-    monkeypatch.setattr(poro.compliance, "GROUPS", 4)
+    monkeypatch.setattr(poro.contact.compliance, "GROUPS", 4)
     rng = np.random.default_rng(0)
     matrix = rng.uniform(0.5, 1.5, (600, 600)).astype(np.float32)
     matrix = np.tril(matrix) + np.tril(matrix, -1).T

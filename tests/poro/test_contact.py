@@ -11,9 +11,8 @@ from scipy.linalg import cholesky
 from scipy.optimize import nnls
 from shapes import box, compliance_of, ellipsoid
 
-from poro.assembly import body_load
-from poro.compliance import Compliance
-from poro.contact import (
+from poro.collapse.model import Theta, assemble, solve
+from poro.contact.active_set import (
     ContactStatus,
     Linearized,
     Obstacle,
@@ -21,13 +20,14 @@ from poro.contact import (
     contact_sensitivity,
     settle,
 )
-from poro.curvature import Springs, group_springs
-from poro.levelset import LevelSet, level_set
+from poro.contact.compliance import Compliance
+from poro.contact.geometric_stiffness import Springs, group_springs
+from poro.contact.levelset import LevelSet, level_set
+from poro.fem.forms import body_load
+from poro.fem.solid import Solid, solid
+from poro.fem.tissue import GRAVITY_KPA_PER_MM, Tissue
 from poro.mesh import closest_points
 from poro.mesh.tetmesh import Array, TetMesh
-from poro.model import Theta, assemble, solve
-from poro.solid import Solid, solid
-from poro.tissue import GRAVITY_KPA_PER_MM, Tissue
 
 
 def _floor(height: float) -> LevelSet:

@@ -6,10 +6,10 @@ import numpy as np
 from numpy.testing import assert_allclose
 from shapes import ellipsoid
 
-from poro.correct import Pull, correct, pull_of
+from poro.fem.tissue import Tissue
+from poro.fit.elastic_correction import Pull, correct, pull_of
+from poro.fit.observations import Target
 from poro.mesh import interpolate, locate
-from poro.observations import Target
-from poro.tissue import Tissue
 
 TISSUE = Tissue()
 GRADIENT = np.array([[-0.1, 0.02, 0.0], [0.03, -0.05, 0.04], [0.0, -0.02, 0.08]])

@@ -9,8 +9,8 @@ import pytest
 from numpy.testing import assert_allclose
 from shapes import ellipsoid
 
-from poro.extrapolate import ExtrapolationStatus, extrapolate
-from poro.tissue import Tissue
+from poro.fem.extrapolation import ExtrapolationStatus, extrapolate
+from poro.fem.tissue import Tissue
 
 TISSUE = Tissue()
 GRADIENT = np.array([[-0.1, 0.02, 0.0], [0.03, -0.05, 0.04], [0.0, -0.02, 0.08]])
@@ -36,7 +36,7 @@ def test_interior_constraints_equal_lagrange_multipliers() -> None:
     from scipy.sparse import bmat, coo_matrix
     from scipy.sparse.linalg import spsolve
 
-    from poro.assembly import stiffness
+    from poro.fem.forms import stiffness
 
     mesh = ellipsoid(20.0)
     nodes = np.array([3, 17, 40, 61, 90])

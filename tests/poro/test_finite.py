@@ -10,14 +10,14 @@ from numpy.testing import assert_allclose
 from scipy.optimize import brentq
 from shapes import box, ellipsoid
 
-from poro.assembly import body_load, deformation_gradient, eigenstress_load, stiffness, tangent_stiffness
-from poro.contact import Obstacle
-from poro.finite import FiniteProblem, FiniteStatus, Wall, deform
-from poro.laws import Law, neo_hookean, saint_venant_kirchhoff
-from poro.levelset import LevelSet
+from poro.collapse.finite_strain import FiniteProblem, FiniteStatus, Wall, deform
+from poro.contact.active_set import Obstacle
+from poro.contact.levelset import LevelSet
+from poro.fem.constitutive import Law, neo_hookean, saint_venant_kirchhoff
+from poro.fem.forms import body_load, deformation_gradient, eigenstress_load, stiffness, tangent_stiffness
+from poro.fem.solid import solid
+from poro.fem.tissue import GRAVITY_KPA_PER_MM, Tissue
 from poro.mesh.tetmesh import Array
-from poro.solid import solid
-from poro.tissue import GRAVITY_KPA_PER_MM, Tissue
 
 TISSUE = Tissue()
 LAWS = [saint_venant_kirchhoff(TISSUE), neo_hookean(TISSUE)]

@@ -10,7 +10,12 @@ import pytest
 from numpy.testing import assert_allclose
 from shapes import ellipsoid
 
-from poro.fit import (
+from poro.collapse.model import PoroState, PoroStatus, PoroSystem, Theta, assemble, sensitivity, solve
+from poro.collapse.modes import hilum_modes, shape_modes, shrinkage_modes
+from poro.fem.tissue import Tissue
+from poro.fit.identifiability import THETA_NAMES, identifiability
+from poro.fit.observations import Observer, Target
+from poro.fit.trust_region import (
     REACH,
     Fit,
     FitSettings,
@@ -22,13 +27,8 @@ from poro.fit import (
     fit,
     point_covariance,
 )
-from poro.identify import THETA_NAMES, identifiability
 from poro.mesh import interpolate, locate
 from poro.mesh.tetmesh import Array
-from poro.model import PoroState, PoroStatus, PoroSystem, Theta, assemble, sensitivity, solve
-from poro.modes import hilum_modes, shape_modes, shrinkage_modes
-from poro.observations import Observer, Target
-from poro.tissue import Tissue
 
 TISSUE = Tissue()
 GRAVITY = np.array([-1.0, 0.0, 0.0])

@@ -8,11 +8,11 @@ from numpy.testing import assert_allclose
 from scipy.sparse import diags
 from shapes import box, ellipsoid, order
 
-from poro.assembly import consistent_mass, laplacian
-from poro.flow import Flow
+from poro.fem.flow import Flow
+from poro.fem.forms import consistent_mass, laplacian
+from poro.fem.tissue import Tissue
+from poro.linalg.solver import linear_solver
 from poro.mesh import TetMesh, stuff_level_set
-from poro.solver import linear_solver
-from poro.tissue import Tissue
 
 TISSUE = Tissue()
 

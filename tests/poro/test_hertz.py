@@ -10,11 +10,11 @@ from numpy.testing import assert_allclose
 from scipy.optimize import brentq
 from shapes import box, compliance_of, order
 
-from poro.contact import ContactState, ContactStatus, Obstacle, settle
-from poro.levelset import LevelSet
+from poro.contact.active_set import ContactState, ContactStatus, Obstacle, settle
+from poro.contact.levelset import LevelSet
+from poro.fem.solid import solid
+from poro.fem.tissue import Tissue
 from poro.mesh.tetmesh import Array, TetMesh
-from poro.solid import solid
-from poro.tissue import Tissue
 
 TISSUE = Tissue()
 RADIUS, CONTACT = 400.0, 8.0  # mm; the wall's slope at the contact's edge is 1 : 50

@@ -9,17 +9,17 @@ import pytest
 from numpy.testing import assert_allclose
 from shapes import compliance_of, ellipsoid
 
-import poro.lockstep
-from poro.assembly import body_load
-from poro.compliance import Compliance
-from poro.contact import ContactState, ContactStatus, Guess, Obstacle, settle
-from poro.curvature import group_springs
-from poro.levelset import level_set
-from poro.lockstep import interpolated, settle_many
+import poro.contact.batched_active_set
+from poro.contact.active_set import ContactState, ContactStatus, Guess, Obstacle, settle
+from poro.contact.batched_active_set import interpolated, settle_many
+from poro.contact.compliance import Compliance
+from poro.contact.geometric_stiffness import group_springs
+from poro.contact.kkt import KeptWall, saddle
+from poro.contact.levelset import level_set
+from poro.fem.forms import body_load
+from poro.fem.solid import solid
+from poro.fem.tissue import GRAVITY_KPA_PER_MM, Tissue
 from poro.mesh.tetmesh import Array
-from poro.saddle import KeptWall, saddle
-from poro.solid import solid
-from poro.tissue import GRAVITY_KPA_PER_MM, Tissue
 
 Hollow = tuple[Compliance, Obstacle, Array, list[float]]
 
@@ -82,8 +82,8 @@ def test_each_load_tells_how_it_ended_and_the_slow_ones_go_on_alone(
         handed.append(args[3])  # type: ignore[arg-type]
         return settle(*args, max_steps=1 if len(handed) == 1 else 30)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(poro.lockstep, "QUICK_STEPS", 2)
-    monkeypatch.setattr(poro.lockstep, "settle", pivoting)
+    monkeypatch.setattr(poro.contact.batched_active_set, "QUICK_STEPS", 2)
+    monkeypatch.setattr(poro.contact.batched_active_set, "settle", pivoting)
     states = settle_many(compliance, obstacle, free, travel, starts)
     assert handed == travel[1:]
     assert [state.status for state in states[:2]] == [ContactStatus.SETTLED, ContactStatus.STOPPED]

@@ -8,17 +8,17 @@ from scipy.sparse import diags
 from scipy.special import spherical_in
 from shapes import box, ellipsoid, order
 
-from poro.assembly import consistent_mass, deformation_gradient, gradient_load, laplacian
-from poro.choice import finite_problem
-from poro.finite import FiniteProblem, FiniteStatus, deform
-from poro.flow import Flow
-from poro.laws import Law, neo_hookean, saint_venant_kirchhoff
+from poro.collapse.choice import finite_problem
+from poro.collapse.finite_strain import FiniteProblem, FiniteStatus, deform
+from poro.collapse.model import PoroState, PoroSystem, Theta, assemble, solve
+from poro.fem.constitutive import Law, neo_hookean, saint_venant_kirchhoff
+from poro.fem.flow import Flow
+from poro.fem.forms import consistent_mass, deformation_gradient, gradient_load, laplacian
+from poro.fem.solid import solid
+from poro.fem.tissue import GRAVITY_KPA_PER_MM, Tissue
+from poro.linalg.solver import linear_solver
 from poro.mesh import TetMesh, stuff_level_set
 from poro.mesh.tetmesh import Array
-from poro.model import PoroState, PoroSystem, Theta, assemble, solve
-from poro.solid import solid
-from poro.solver import linear_solver
-from poro.tissue import GRAVITY_KPA_PER_MM, Tissue
 
 TISSUE, STRAIGHT = Tissue(), Tissue(poisson=0.0)
 HEIGHT = 40.0

@@ -10,7 +10,8 @@ from shapes import box, ellipsoid, order
 from skfem import Basis, BilinearForm, ElementTetP1, ElementVector, MeshTet
 from skfem.helpers import ddot, grad, sym_grad, trace
 
-from poro.assembly import (
+from poro.collapse.modes import eigenstrain_mode
+from poro.fem.forms import (
     body_load,
     consistent_mass,
     deformation_gradient,
@@ -19,11 +20,10 @@ from poro.assembly import (
     laplacian,
     stiffness,
 )
+from poro.fem.solid import solid
+from poro.fem.tissue import GRAVITY_KPA_PER_MM, Tissue
+from poro.linalg.solver import Multigrid, linear_solver, rigid_modes
 from poro.mesh.tetmesh import Array, TetMesh
-from poro.modes import eigenstrain_mode
-from poro.solid import solid
-from poro.solver import Multigrid, linear_solver, rigid_modes
-from poro.tissue import GRAVITY_KPA_PER_MM, Tissue
 
 TISSUE = Tissue()
 

@@ -7,11 +7,11 @@ import pytest
 from numpy.testing import assert_allclose
 from shapes import ellipsoid
 
+from poro.collapse.model import PoroStatus, PoroSystem, Theta, assemble, solve, solve_many
+from poro.fem.pressure_basis import Suction
+from poro.fem.solid import Solid
+from poro.fem.tissue import Tissue
 from poro.mesh.tetmesh import Array
-from poro.model import PoroStatus, PoroSystem, Theta, assemble, solve, solve_many
-from poro.solid import Solid
-from poro.suction import Suction
-from poro.tissue import Tissue
 
 
 @pytest.fixture(scope="module")

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from poro.choice import keep_in_range
-from poro.fit import Fit, FitSettings, fit
-from poro.laws import neo_hookean
+from poro.collapse.choice import keep_in_range
+from poro.collapse.model import Theta, assemble, solve
+from poro.fem.constitutive import neo_hookean
+from poro.fem.tissue import Tissue
+from poro.fit.observations import Target
+from poro.fit.trust_region import Fit, FitSettings, fit
 from poro.mesh import TetMesh, stuff
-from poro.model import Theta, assemble, solve
-from poro.observations import Target
-from poro.tissue import Tissue
 from registration.matching import Pairs
 from vatsloc.workflow.ladder import NO_OTHERS, Model, Step, best_of, corrected, held_back, misfit
 from vatsloc.workflow.spread import other_answers

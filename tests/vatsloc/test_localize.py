@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from poro.fem.tissue import Tissue
 from poro.mesh import TetMesh
-from poro.tissue import Tissue
 from registration.rigid import RigidTransform
 from vatsloc.case import read_case
 from vatsloc.evaluation import evaluate_case

@@ -11,9 +11,9 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.sparse import csr_matrix
 
+from poro.fem.tissue import Tissue
 from poro.mesh import TetMesh
 from poro.mesh.tetmesh import dihedral_angles
-from poro.tissue import Tissue
 from vatsloc.study import bench_poro as bench
 from vatsloc.study import cost_poro as cost
 from vatsloc.study import stability_poro as stability

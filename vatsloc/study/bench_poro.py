@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from poro.collapse.model import PoroSystem, Theta, solve, solve_many, without_wall
+from poro.fem.tissue import Tissue
 from poro.mesh.tetmesh import Array
-from poro.model import PoroSystem, Theta, solve, solve_many, without_wall
-from poro.tissue import Tissue
 from vatsloc.study.cost_poro import STAGES, cost_rows, measure_sizes, warm
 from vatsloc.study.getfem_peer import GetfemAnswer, getfem_python, run_getfem
 from vatsloc.study.poro_lung import Lung, lung, smooth_wall, system_of

@@ -6,9 +6,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from poro.model import Theta, solve, without_wall
-from poro.solver import Multigrid
-from poro.tissue import Tissue
+from poro.collapse.model import Theta, solve, without_wall
+from poro.fem.tissue import Tissue
+from poro.linalg.solver import Multigrid
 from vatsloc.study.isolated import isolated
 from vatsloc.study.poro_lung import lung, smooth_wall, system_of
 from vatsloc.study.tables import Row

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
+from poro.collapse.model import PoroSystem, Theta
+from poro.fem.tissue import GRAVITY_KPA_PER_MM
 from poro.mesh.tetmesh import Array
-from poro.model import PoroSystem, Theta
-from poro.tissue import GRAVITY_KPA_PER_MM
 from vatsloc.errors import VatslocError
 from vatsloc.study.poro_lung import WALL
 

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from poro.levelset import LevelSet
+from poro.collapse.model import PoroSystem, assemble
+from poro.contact.levelset import LevelSet
+from poro.fem.tissue import Tissue
 from poro.mesh import TetMesh, stuff_level_set
 from poro.mesh.tetmesh import Array
-from poro.model import PoroSystem, assemble
-from poro.tissue import Tissue
 
 RADII_MM = np.array([45.0, 65.0, 100.0])
 # An ellipsoid with a bay for the heart and a dome for the diaphragm, 1 l; positive inside, in mm.

@@ -10,11 +10,11 @@ from pathlib import Path
 
 import numpy as np
 
-from poro import identify
-from poro.fit import FitStatus, bounds, fit
-from poro.model import PoroSystem, assemble
-from poro.observations import Target
-from poro.tissue import Tissue
+from poro.collapse.model import PoroSystem, assemble
+from poro.fem.tissue import Tissue
+from poro.fit import identifiability as identify
+from poro.fit.observations import Target
+from poro.fit.trust_region import FitStatus, bounds, fit
 from registration.rigid import RigidTransform
 from registration.volume import Array
 from vatsloc.case import Case, read_case

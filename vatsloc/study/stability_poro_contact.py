@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 from scipy.sparse import bsr_matrix
 
+from poro.collapse.model import PoroState, PoroSystem, Theta, solve
+from poro.fem.solid import solid
+from poro.fem.tissue import GRAVITY_KPA_PER_MM, Tissue
 from poro.mesh import interpolate, locate
-from poro.model import PoroState, PoroSystem, Theta, solve
-from poro.solid import solid
-from poro.tissue import GRAVITY_KPA_PER_MM, Tissue
 from vatsloc.study.poro_lung import lung, smooth_wall, system_of
 from vatsloc.study.tables import Row
 

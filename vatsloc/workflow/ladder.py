@@ -11,16 +11,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from poro.choice import Chosen, Range, keep_in_range
-from poro.choice import Model as Strain
-from poro.correct import correct, pull_of
-from poro.fit import Fit, FitSettings, FitStatus, fit
-from poro.laws import neo_hookean
+from poro.collapse.choice import Chosen, Range, keep_in_range
+from poro.collapse.choice import Model as Strain
+from poro.collapse.model import PoroStatus, PoroSystem, assemble
+from poro.collapse.modes import hilum_modes, shape_modes
+from poro.fem.constitutive import neo_hookean
+from poro.fem.tissue import Tissue
+from poro.fit.elastic_correction import correct, pull_of
+from poro.fit.observations import Target
+from poro.fit.trust_region import Fit, FitSettings, FitStatus, fit
 from poro.mesh import TetMesh, interpolate, locate
-from poro.model import PoroStatus, PoroSystem, assemble
-from poro.modes import hilum_modes, shape_modes
-from poro.observations import Target
-from poro.tissue import Tissue
 from registration.matching import Pairs
 from registration.volume import Array
 from vatsloc.imaging.surface import Border, SurfacePoints

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from poro.fit import FitStatus, ellipsoid95
+from poro.collapse.model import PoroStatus
+from poro.fit.trust_region import FitStatus, ellipsoid95
 from poro.mesh import closest_points
 from poro.mesh.tetmesh import signed_volumes
-from poro.model import PoroStatus
 from registration.spine import RigidFit
 from registration.volume import Array, Mask
 from vatsloc.case import Case

@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from poro.fit import Fit
-from poro.identify import Identifiability, identifiability
+from poro.collapse.model import PoroSystem
+from poro.fit.identifiability import Identifiability, identifiability
+from poro.fit.trust_region import Fit
 from poro.mesh import TetMesh, TriSurface, interpolate, locate
-from poro.model import PoroSystem
 from registration.rigid import RigidTransform
 from registration.volume import Array
 from vatsloc.case import Case

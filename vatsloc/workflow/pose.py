@@ -9,9 +9,9 @@ from functools import partial
 import numpy as np
 from scipy import ndimage
 
-from poro.extrapolate import Extrapolation, extrapolate
+from poro.fem.extrapolation import Extrapolation, extrapolate
+from poro.fem.tissue import Tissue
 from poro.mesh import TetMesh, stuff
-from poro.tissue import Tissue
 from registration.ffd import FfdFit, FfdSettings, Weights
 from registration.field import PointMap
 from registration.inversion import Inversion, invert_at

@@ -13,9 +13,9 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from poro.extrapolate import extrapolate
+from poro.fem.extrapolation import extrapolate
+from poro.fem.tissue import Tissue
 from poro.mesh import TetMesh
-from poro.tissue import Tissue
 from registration.ffd import FfdSettings, Weights, register_ffd
 from registration.inversion import invert_at
 from registration.matching import Pairs

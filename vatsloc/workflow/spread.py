@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from poro.fit import Fit, FitSettings, fit
-from poro.model import PoroStatus, PoroSystem
-from poro.observations import Target
+from poro.collapse.model import PoroStatus, PoroSystem
+from poro.fit.observations import Target
+from poro.fit.trust_region import Fit, FitSettings, fit
 from registration.rigid import RigidTransform
 from registration.volume import Array
 

@@ -7,12 +7,12 @@ from enum import Enum
 
 import numpy as np
 
-from poro.assembly import body_load, deformation_gradient
-from poro.finite import FiniteProblem, FiniteState, FiniteStatus, Wall, deform
-from poro.laws import Law
+from poro.collapse.finite_strain import FiniteProblem, FiniteState, FiniteStatus, Wall, deform
+from poro.collapse.model import PoroState, PoroStatus, PoroSystem, Theta, solve
+from poro.fem.constitutive import Law
+from poro.fem.forms import body_load, deformation_gradient
+from poro.fem.tissue import GRAVITY_KPA_PER_MM
 from poro.mesh.tetmesh import Array
-from poro.model import PoroState, PoroStatus, PoroSystem, Theta, solve
-from poro.tissue import GRAVITY_KPA_PER_MM
 
 
 class Model(Enum):

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import get_lapack_funcs, lu_factor, lu_solve, solve_triangular
 
-from poro.compliance import Compliance
-from poro.curvature import Springs
+from poro.contact.compliance import Compliance
+from poro.contact.geometric_stiffness import Springs
 from poro.mesh.tetmesh import Array
 
 

@@ -11,8 +11,8 @@ import numpy as np
 import pyamg
 from scipy.sparse import bsr_matrix, csr_matrix
 
-from poro.cholesky import Cholesky, cholesky
-from poro.dissection import Tree, dissect
+from poro.linalg.cholesky import Cholesky, cholesky
+from poro.linalg.dissection import Tree, dissect
 from poro.mesh.tetmesh import Array
 
 # Numbers in a factor above which memory (8 bytes each) decides for the iterative solver.

@@ -12,11 +12,11 @@ from enum import Enum
 import numpy as np
 from scipy.sparse import bsr_matrix, csr_matrix, diags
 
-from poro.assembly import deformation_gradient, eigenstress_load, tangent_stiffness
-from poro.contact import Obstacle
-from poro.laws import Law
+from poro.contact.active_set import Obstacle
+from poro.fem.constitutive import Law
+from poro.fem.forms import deformation_gradient, eigenstress_load, tangent_stiffness
+from poro.linalg.solver import linear_solver
 from poro.mesh.tetmesh import Array, TetMesh
-from poro.solver import linear_solver
 
 _SHRINK, _MAX_HALVINGS = 0.5, 12
 _MAX_SETS = 15

@@ -12,14 +12,14 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import diags
 
-from poro.assembly import deformation_gradient
+from poro.fem.constraints import point_operator, springs
+from poro.fem.forms import deformation_gradient
+from poro.fem.solid import solid
+from poro.fem.tissue import Tissue
+from poro.fit.observations import Target, independence
 from poro.mesh.closest import closest_points
 from poro.mesh.locate import Location, locate
 from poro.mesh.tetmesh import Array, TetMesh
-from poro.observations import Target, independence
-from poro.solid import solid
-from poro.springs import point_operator, springs
-from poro.tissue import Tissue
 
 REGION_MM3 = 1e5
 

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import csr_matrix
 
-from poro.flow import Flow
+from poro.fem.flow import Flow
+from poro.fem.solid import Solid
 from poro.mesh.tetmesh import Array
-from poro.solid import Solid
 
 TOLERANCE = 1e-9  # of the residual relative to the load, for the pressure and for its derivative
 

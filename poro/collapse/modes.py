@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from poro.assembly import eigenstress_load
+from poro.fem.forms import eigenstress_load
+from poro.fem.tissue import Tissue
 from poro.mesh.tetmesh import Array, TetMesh
-from poro.tissue import Tissue
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from poro.compliance import Compliance, Groups
+from poro.contact.compliance import Compliance, Groups
 from poro.mesh.tetmesh import Array
 
 SPRING_CUT = 0.03  # springs softer than this share of the stiffest wait for the next linearization

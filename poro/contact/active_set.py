@@ -13,12 +13,12 @@ from functools import cached_property
 import numpy as np
 from scipy.linalg import lu_factor, lu_solve, solve
 
-from poro.anderson import Anderson
-from poro.compliance import Compliance
-from poro.curvature import Springs, group_springs
-from poro.levelset import LevelSet
+from poro.contact.compliance import Compliance
+from poro.contact.geometric_stiffness import Springs, group_springs
+from poro.contact.kkt import saddle
+from poro.contact.levelset import LevelSet
+from poro.linalg.anderson import Anderson
 from poro.mesh.tetmesh import Array
-from poro.saddle import saddle
 
 GAP_TOLERANCE_MM = 1e-9
 QUICK_STEPS = 10  # linearizations in which the active set is exchanged once, as in a semismooth Newton method

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from poro.fem.tissue import Tissue
 from poro.mesh.tetmesh import Array
-from poro.tissue import Tissue
 
 
 @dataclass(frozen=True)

@@ -11,11 +11,11 @@ from enum import Enum
 import numpy as np
 from scipy.sparse import coo_matrix
 
-from poro.assembly import deformation_gradient
+from poro.fem.constraints import springs
+from poro.fem.forms import deformation_gradient
+from poro.fem.solid import solid
+from poro.fem.tissue import Tissue
 from poro.mesh.tetmesh import Array, TetMesh
-from poro.solid import solid
-from poro.springs import springs
-from poro.tissue import Tissue
 
 
 class ExtrapolationStatus(Enum):

@@ -10,7 +10,7 @@ from numba import njit
 from scipy.linalg import blas, lapack
 from scipy.sparse import csr_matrix
 
-from poro.dissection import Front, Tree
+from poro.linalg.dissection import Front, Tree
 from poro.mesh.tetmesh import Array
 
 STRIP = 512  # rows of an inverse that are added at a time, to keep what is in between small

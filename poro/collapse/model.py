@@ -10,18 +10,18 @@ from functools import cached_property
 import numpy as np
 from scipy.sparse import csr_matrix
 
-from poro.assembly import body_load, gradient_load
-from poro.compliance import Compliance
-from poro.contact import ContactState, ContactStatus, Obstacle, contact_sensitivity, settle
-from poro.flow import Flow
-from poro.levelset import LevelSet, level_set
-from poro.lockstep import interpolated, settle_many
+from poro.collapse.modes import LoadMode
+from poro.contact.active_set import ContactState, ContactStatus, Obstacle, contact_sensitivity, settle
+from poro.contact.batched_active_set import interpolated, settle_many
+from poro.contact.compliance import Compliance
+from poro.contact.levelset import LevelSet, level_set
+from poro.fem.flow import Flow
+from poro.fem.forms import body_load, gradient_load
+from poro.fem.pressure_basis import Suction
+from poro.fem.solid import Solid, solid, unknowns_of
+from poro.fem.tissue import GRAVITY_KPA_PER_MM, Tissue
 from poro.mesh.patches import patches, principal_axis
 from poro.mesh.tetmesh import Array, TetMesh, signed_volumes
-from poro.modes import LoadMode
-from poro.solid import Solid, solid, unknowns_of
-from poro.suction import Suction
-from poro.tissue import GRAVITY_KPA_PER_MM, Tissue
 
 KAPPA_B_BOUNDS = (1e-14, 1e-4)
 PHI_BOUNDS = (0.0, 0.93)

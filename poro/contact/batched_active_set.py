@@ -11,9 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from poro.anderson import Anderson
-from poro.compliance import Compliance
-from poro.contact import (
+from poro.contact.active_set import (
     GAP_TOLERANCE_MM,
     MAX_MOVE_MM,
     MIX_MM,
@@ -24,9 +22,11 @@ from poro.contact import (
     Obstacle,
     settle,
 )
-from poro.curvature import group_springs
+from poro.contact.compliance import Compliance
+from poro.contact.geometric_stiffness import group_springs
+from poro.contact.kkt import KeptWall, saddle
+from poro.linalg.anderson import Anderson
 from poro.mesh.tetmesh import Array
-from poro.saddle import KeptWall, saddle
 
 KEEP_MM = 1.0  # last move up to which a factor may be kept
 KEEP_FLIPS = 30  # and nodes that may have come or gone since it was made

@@ -8,9 +8,7 @@ from enum import Enum
 
 import numpy as np
 
-from poro.mesh.locate import interpolate, locate
-from poro.mesh.tetmesh import Array
-from poro.model import (
+from poro.collapse.model import (
     DIAPHRAGM_BOUNDS_MM,
     KAPPA_B_BOUNDS,
     PHI_BOUNDS,
@@ -21,7 +19,9 @@ from poro.model import (
     sensitivity,
     solve,
 )
-from poro.observations import Observer, Residuals, Target, independence
+from poro.fit.observations import Observer, Residuals, Target, independence
+from poro.mesh.locate import interpolate, locate
+from poro.mesh.tetmesh import Array
 
 CHI2_95_3D = 7.814728  # 95 % quantile of chi-squared with three degrees of freedom
 # Longest step in (log10 kappa_b, phi, d_diaph_mm): beyond it the contact seen from here says nothing.

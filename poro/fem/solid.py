@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import csr_matrix
 
-from poro.assembly import stiffness
+from poro.fem.forms import stiffness
+from poro.fem.tissue import Tissue
+from poro.linalg.solver import LinearSolver, linear_solver
 from poro.mesh.tetmesh import Array, TetMesh
-from poro.solver import LinearSolver, linear_solver
-from poro.tissue import Tissue
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,8 @@ from functools import cached_property
 import numpy as np
 from numba import njit
 
+from poro.linalg.solver import LinearSolver, inverse_at
 from poro.mesh.tetmesh import Array
-from poro.solver import LinearSolver, inverse_at
 
 DOUBLE_UNKNOWNS = 3000
 GROUPS = 128  # of contact nodes: about 2 cm of a lung's surface each

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from poro.fit import REACH, Fit, bounds
+from poro.collapse.model import PoroSystem
+from poro.fit.trust_region import REACH, Fit, bounds
 from poro.mesh.tetmesh import Array
-from poro.model import PoroSystem
 
 THETA_NAMES = ("log10 kappa_b", "phi", "d_diaph_mm")
 AT_BOUND = 1e-3  # share of a parameter's range within which it counts as at its bound
