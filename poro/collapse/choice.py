@@ -1,4 +1,4 @@
-"""The model a lung needs: linear while its answer stays in its range, finite strain where it does not."""
+"""The strain measure a lung needs: linear while its answer stays in its range, finite where it does not."""
 
 from __future__ import annotations
 
@@ -7,15 +7,16 @@ from enum import Enum
 
 import numpy as np
 
-from poro.collapse.finite_strain import FiniteProblem, FiniteState, FiniteStatus, Wall, deform
-from poro.collapse.model import PoroState, PoroStatus, PoroSystem, Theta, solve
-from poro.fem.constitutive import Law
+from poro.arrays import Array
+from poro.collapse.finite_strain import FiniteProblem, FiniteState, FiniteStatus, WallContact, deform
+from poro.collapse.model import PoroSystem, Theta
+from poro.collapse.solution import PoroState, PoroStatus, solve
+from poro.fem.constitutive import ConstitutiveModel
 from poro.fem.forms import body_load, deformation_gradient
 from poro.fem.tissue import GRAVITY_KPA_PER_MM
-from poro.mesh.tetmesh import Array
 
 
-class Model(Enum):
+class StrainMeasure(Enum):
     """Which strain measure an answer rests on."""
 
     LINEAR = "linear strain"
@@ -23,7 +24,7 @@ class Model(Enum):
 
 
 @dataclass(frozen=True)
-class Range:
+class LinearRange:
     """Where linear strain is believed: at most `share` of the elements may have det F below `min_det`."""
 
     min_det: float = 0.2
@@ -31,65 +32,68 @@ class Range:
 
 
 @dataclass(frozen=True)
-class Chosen:
-    """state: of the model that ran; why: one sentence; share: of elements that the linear answer strains too far;
-    finite: the finite-strain run, None when none was needed.
+class StrainChoice:
+    """state: of the measure that was used; why: one sentence; share: of elements that the linear answer strains too
+    far; finite: the finite-strain run, None when none was needed.
     """
 
     state: PoroState
-    model: Model
+    strain: StrainMeasure
     why: str
     share: float
     finite: FiniteState | None
 
     def entry(self) -> dict[str, str | float]:
         """What a run's record says of it."""
-        return {"model": self.model.value, "why": self.why, "share_out_of_range": self.share}
+        return {"strain": self.strain.value, "why": self.why, "share_out_of_range": self.share}
 
 
-def finite_problem(system: PoroSystem, theta: Theta, law: Law) -> FiniteProblem:
+def finite_problem(system: PoroSystem, theta: Theta, material: ConstitutiveModel) -> FiniteProblem:
     """The system's loads and wall for the finite-strain solver; raises ValueError for a system with load modes."""
     if system.modes:
         raise ValueError(f"finite strain knows no load modes, the system has {len(system.modes)}; assemble without")
     p, _ = system.flow.pressure(theta.kappa_b)
     tissue = system.tissue
     weight = body_load(system.mesh, system.gravity * GRAVITY_KPA_PER_MM * tissue.density(theta.phi))
-    suction = tissue.biot * (tissue.pleural_kpa - p[system.mesh.tets].mean(axis=1))
-    wall = Wall(system.obstacle, system.contact_nodes, theta.d_diaph_mm)
-    return FiniteProblem(system.mesh, law, system.hilum, system.hilum_displacement, weight, wall, suction)
+    pressure_drop = tissue.biot * (tissue.pleural_kpa - p[system.mesh.tets].mean(axis=1))
+    contact = WallContact(system.wall, system.contact_nodes, theta.d_diaph_mm)
+    return FiniteProblem(system.mesh, material, system.hilum, system.hilum_displacement, weight, contact, pressure_drop)
 
 
-def solve_in_range(system: PoroSystem, theta: Theta, law: Law, within: Range | None = None) -> Chosen:
-    """Solve linearly, and again by `law` at finite strain when the linear answer leaves its range."""
-    return keep_in_range(system, solve(system, theta), law, within)
+def solve_in_range(
+    system: PoroSystem, theta: Theta, material: ConstitutiveModel, within: LinearRange | None = None
+) -> StrainChoice:
+    """Solve linearly, and again with `material` at finite strain when the linear answer leaves its range."""
+    return keep_in_range(system, solve(system, theta), material, within)
 
 
-def keep_in_range(system: PoroSystem, linear: PoroState, law: Law, within: Range | None = None) -> Chosen:
-    """The linear answer, for instance a fit's, where it is in its range; the same load by `law` where it is not.
+def keep_in_range(
+    system: PoroSystem, linear: PoroState, material: ConstitutiveModel, within: LinearRange | None = None
+) -> StrainChoice:
+    """The linear answer, for instance a fit's, where it is in its range; the same load on `material` where it is not.
 
     Raises ValueError when it is not and the system carries load modes, which finite strain does not know.
     """
-    within = within or Range()
+    within = within or LinearRange()
     share = float((linear.det_f < within.min_det).mean())
     told = f"{100 * share:.2f} % of the elements have det F below {within.min_det} under linear strain"
     allowed = f"{100 * within.share:.2f} % allowed"
     if share <= within.share:
-        return Chosen(linear, Model.LINEAR, f"linear strain: {told}, {allowed}", share, None)
-    finite = deform(finite_problem(system, linear.theta, law))
+        return StrainChoice(linear, StrainMeasure.LINEAR, f"linear strain: {told}, {allowed}", share, None)
+    finite = deform(finite_problem(system, linear.theta, material))
     if finite.status is FiniteStatus.STOPPED:
-        why = (
-            f"linear strain although {told}, {allowed}: {law.name} carried only {100 * finite.share:.0f} % of the load"
-        )
-        return Chosen(linear, Model.LINEAR, why, share, finite)
+        carried = f"{material.name} carried only {100 * finite.share:.0f} % of the load"
+        why = f"linear strain although {told}, {allowed}: {carried}"
+        return StrainChoice(linear, StrainMeasure.LINEAR, why, share, finite)
     state = _as_state(system, linear.theta, linear, finite)
-    return Chosen(state, Model.FINITE, f"{law.name}: {told}, {allowed}", share, finite)
+    return StrainChoice(state, StrainMeasure.FINITE, f"{material.name}: {told}, {allowed}", share, finite)
 
 
 def _as_state(system: PoroSystem, theta: Theta, linear: PoroState, finite: FiniteState) -> PoroState:
     nodes = system.contact_nodes
     u, active = finite.u, np.zeros(len(finite.u), bool)
     active[nodes] = finite.active
-    gap, gradient, hessian = system.obstacle.gap(u[nodes], theta.d_diaph_mm)
+    gap, gradient, hessian = system.wall.gap(u[nodes], theta.d_diaph_mm)
     area = np.zeros(len(u))
     area[system.mesh.boundary.nodes] = system.mesh.boundary.node_areas
     contact = replace(

@@ -1,6 +1,6 @@
-"""Lung at finite strain in front of a rigid wall: Newton with line search, load stepping and the active set of contact.
+"""Lung at finite strain in front of its chest wall: Newton with line search, load stepping, active set of contact.
 
-Weight stays as on the body at rest; the pressure's pull follows the deformed lung.
+Weight stays as on the body at rest; the pressure's force follows the deformed lung.
 Ref: Alvarez 2021, eqs. 12-14; Bonet & Wood 2008, ch. 9.
 """
 
@@ -12,12 +12,16 @@ from enum import Enum
 import numpy as np
 from scipy.sparse import bsr_matrix, csr_matrix, diags
 
-from poro.contact.active_set import Obstacle
-from poro.fem.constitutive import Law
+from poro.arrays import Array
+from poro.contact.chest_wall import ChestWall
+from poro.errors import SolverError
+from poro.fem.constitutive import ConstitutiveModel
 from poro.fem.forms import deformation_gradient, eigenstress_load, tangent_stiffness
 from poro.linalg.solver import linear_solver
-from poro.mesh.tetmesh import Array, TetMesh
+from poro.mesh.tetmesh import TetMesh
 
+_MAX_NEWTON = 25  # steps for one share of the load
+_SMALLEST_STEP = 1 / 64  # of the load
 _SHRINK, _MAX_HALVINGS = 0.5, 12
 _MAX_SETS = 15
 _NEAR = 1e-2  # relative residual below which the full tangent is tried first
@@ -31,27 +35,27 @@ class FiniteStatus(Enum):
 
 
 @dataclass(frozen=True)
-class Wall:
-    """Rigid wall in front of contact nodes (nc,), its moving part shifted by travel_mm."""
+class WallContact:
+    """Chest wall in front of contact nodes (nc,), its moving part shifted by travel_mm."""
 
-    obstacle: Obstacle
+    wall: ChestWall
     nodes: Array
     travel_mm: float
 
 
 @dataclass(frozen=True)
 class FiniteProblem:
-    """Body of one law, held at nodes `fixed` (k,) moved by imposed (k, 3) mm, under nodal forces load (n, 3) kPa mm2
-    and suction (m,) kPa: how far alpha p in an element lies below its value at the surface.
+    """Body of one constitutive model, held at nodes `fixed` (k,) moved by imposed (k, 3) mm, under nodal forces load
+    (n, 3) kPa mm2 and pressure_drop (m,) kPa: how far alpha p in an element lies below its value at the surface.
     """
 
     mesh: TetMesh
-    law: Law
+    material: ConstitutiveModel
     fixed: Array
     imposed: Array
     load: Array
-    wall: Wall | None = None
-    suction: Array | None = None
+    contact: WallContact | None = None
+    pressure_drop: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -69,43 +73,44 @@ class FiniteState:
     status: FiniteStatus
 
 
-def deform(
-    problem: FiniteProblem, tolerance: float = 1e-8, max_newton: int = 25, min_step: float = 1 / 64
-) -> FiniteState:
-    """Raise the load in steps, halved when Newton fails and doubled when it does not, until all of it is carried."""
-    contacts = 0 if problem.wall is None else len(problem.wall.nodes)
+def deform(problem: FiniteProblem, tolerance: float = 1e-8) -> FiniteState:
+    """Raise the load in steps, halved when Newton fails and doubled when it does not, until all of it is carried.
+
+    tolerance: relative residual of a balanced lung.
+    """
+    contacts = 0 if problem.contact is None else len(problem.contact.nodes)
     u, force, active = np.zeros_like(problem.load), np.zeros(contacts), np.zeros(contacts, bool)
     share, step, taken = 0.0, 0.25, 0
     residuals: list[float] = []
     while share < 1:
         step = min(step, 1 - share)
-        tried = _newton(problem, share, share + step, (u, force, active), residuals, tolerance, max_newton)
+        tried = _newton(problem, share, share + step, (u, force, active), residuals, tolerance)
         if tried is not None:
             u, force, active = tried
             share, step, taken = share + step, 2 * step, taken + 1
         else:
             step /= 2
-            if step < min_step:
+            if step < _SMALLEST_STEP:
                 break
     status = FiniteStatus.SOLVED if share >= 1 else FiniteStatus.STOPPED
     return FiniteState(u, force, active, share, tuple(residuals), taken, status)
 
 
 def _gap(problem: FiniteProblem, u: Array, share: float) -> tuple[Array, Array, Array]:
-    if problem.wall is None:
+    if problem.contact is None:
         return np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3, 3))
-    return problem.wall.obstacle.gap(u[problem.wall.nodes], share * problem.wall.travel_mm)
+    return problem.contact.wall.gap(u[problem.contact.nodes], share * problem.contact.travel_mm)
 
 
 def _respond(problem: FiniteProblem, f: Array, share: float) -> tuple[Array, Array, Array]:
-    """Energy, stress and moduli of the tissue and of `share` of the suction.
+    """Energy, stress and moduli of the tissue and of `share` of the pressure drop.
 
-    The force -alpha grad p of the deformed lung does the work of the suction q on the volume: energy q J.
+    The force -alpha grad p of the deformed lung does the work of the pressure drop q on the volume: energy q J.
     """
-    energy, stress, moduli = problem.law.respond(f)
-    if problem.suction is None:
+    energy, stress, moduli = problem.material.respond(f)
+    if problem.pressure_drop is None:
         return energy, stress, moduli
-    q = share * problem.suction * np.linalg.det(f)
+    q = share * problem.pressure_drop * np.linalg.det(f)
     inverse = np.linalg.inv(f).transpose(0, 2, 1)
     pairs = np.einsum("mij,mkl->mijkl", inverse, inverse)
     return (
@@ -122,15 +127,14 @@ def _newton(
     start: tuple[Array, Array, Array],
     residuals: list[float],
     tolerance: float,
-    max_newton: int,
 ) -> tuple[Array, Array, Array] | None:
     """Displacement, contact forces and active set that carry `share` of the load, from those at `before`, or None."""
     u, force, active = start
     load = share * problem.load
     jump = (share - before) * problem.imposed
-    nodes = np.zeros(0, int) if problem.wall is None else problem.wall.nodes
+    nodes = np.zeros(0, int) if problem.contact is None else problem.contact.nodes
     last = np.inf
-    for _ in range(max_newton):
+    for _ in range(_MAX_NEWTON):
         _, stress, moduli = _respond(problem, deformation_gradient(problem.mesh, u), share)
         unbalanced = load - eigenstress_load(problem.mesh, stress)
         gap, gradient, hessian = _gap(problem, u, share)
@@ -161,8 +165,8 @@ def _newton(
         np.add.at(rest, nodes, gradient * force[:, None])
         reaction = rest[problem.fixed]
         rest[problem.fixed] = 0
-        pulls = (float(np.abs(part).max(initial=0)) for part in (load, reaction, force))
-        scale = max(*pulls, share * _pull_of_suction(problem), 1e-12)
+        forces = (float(np.abs(part).max(initial=0)) for part in (load, reaction, force))
+        scale = max(*forces, share * _force_of_pressure(problem), 1e-12)
         last = float(np.abs(rest).max()) / scale
         residuals.append(last)
         if last < tolerance and not behind.any() and length == 1:
@@ -170,11 +174,11 @@ def _newton(
     return None
 
 
-def _pull_of_suction(problem: FiniteProblem) -> float:
-    """Nodal force that the suction exerts where it varies, kPa mm2: it balances itself, so reactions do not show it."""
-    if problem.suction is None:
+def _force_of_pressure(problem: FiniteProblem) -> float:
+    """Nodal force of the pressure drop where it varies, kPa mm2: it balances itself, so reactions do not show it."""
+    if problem.pressure_drop is None:
         return 0.0
-    return float(np.abs(problem.suction).max() * np.cbrt(problem.mesh.volumes.mean()) ** 2)
+    return float(np.abs(problem.pressure_drop).max() * np.cbrt(problem.mesh.volumes.mean()) ** 2)
 
 
 def _linearized_contact(
@@ -182,11 +186,11 @@ def _linearized_contact(
 ) -> tuple[Array, Array, Array] | None:
     """Step, contact forces >= 0 and active set of the linearized problem; None when it has no lowest energy."""
     gap, gradient, active = contact
-    nodes = np.zeros(0, int) if problem.wall is None else problem.wall.nodes
+    nodes = np.zeros(0, int) if problem.contact is None else problem.contact.nodes
     for _ in range(_MAX_SETS):
         try:
             change, force = _constrained_step(problem, matrix, unbalanced, (gap, gradient, active), jump)
-        except ValueError:
+        except SolverError:
             return None
         ahead = gap + np.einsum("nd,nd->n", gradient, change[nodes])
         turned = (active & (force < 0)) | (~active & (ahead < -1e-9))
@@ -215,11 +219,11 @@ def _constrained_step(
     """Newton step (n, 3) that closes the gap at active nodes and moves the held ones by `jump`; contact forces (nc,).
 
     Active nodes are turned so that their first axis is the wall's normal, and that unknown is then imposed. Raises
-    ValueError when the tangent is not positive definite.
+    SolverError when the tangent is not positive definite.
     """
     gap, gradient, active = contact
     count = len(unbalanced)
-    nodes = np.zeros(0, int) if problem.wall is None else problem.wall.nodes
+    nodes = np.zeros(0, int) if problem.contact is None else problem.contact.nodes
     pressed = nodes[active]
     steep = np.linalg.norm(gradient[active], axis=1)
     frames = np.broadcast_to(np.eye(3), (count, 3, 3)).copy()

@@ -1,5 +1,5 @@
-"""Loads beyond the paper's: smooth fields of shrinkage and small motions of the hilum, each a column of one linear
-system.
+"""Loads beyond the paper's: uniform strains of the resting shape and small motions of the hilum, each a column of one
+linear system.
 """
 
 from __future__ import annotations
@@ -8,9 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from poro.arrays import Array
 from poro.fem.forms import eigenstress_load
 from poro.fem.tissue import Tissue
-from poro.mesh.tetmesh import Array, TetMesh
+from poro.mesh.tetmesh import TetMesh
 
 
 @dataclass(frozen=True)
@@ -33,45 +34,15 @@ def eigenstrain_mode(mesh: TetMesh, tissue: Tissue, name: str, strain: Array, si
     return LoadMode(name, eigenstress_load(mesh, stress), np.zeros_like(mesh.points), sigma)
 
 
-def lung_coordinates(mesh: TetMesh, gravity: Array) -> Array:
-    """Centroids of the elements in (gravity, foot to head, third axis), each scaled to about [-1, 1], (m, 3)."""
-    up = np.array([0.0, 0.0, 1.0])
-    first = gravity - (gravity @ up) * up
-    first = first / np.linalg.norm(first) if np.linalg.norm(first) > 1e-6 else np.array([1.0, 0.0, 0.0])
-    axes = np.stack([first, up, np.cross(first, up)], axis=1)
-    along = mesh.points[mesh.tets].mean(axis=1) @ axes
-    low, high = along.min(axis=0), along.max(axis=0)
-    return 2 * (along - low) / (high - low) - 1
-
-
-def shrinkage_modes(
-    mesh: TetMesh, tissue: Tissue, gravity: Array, degree: int = 1, sigma: float = 0.1
-) -> tuple[LoadMode, ...]:
-    """Isotropic stretch of the stress-free shape, as polynomials of total `degree` in the lung's own coordinates."""
-    x = lung_coordinates(mesh, gravity)
+def uniform_strain_modes(mesh: TetMesh, tissue: Tissue, sigma: float = 0.1) -> tuple[LoadMode, ...]:
+    """The six components of a uniform strain of the stress-free shape, volume kept or not."""
     result = []
-    for powers in _powers(degree):
-        weight = np.prod(x ** np.array(powers), axis=1)
-        strain = weight[:, None, None] * np.eye(3)
-        name = "stretch g{} h{} t{}".format(*powers)
-        result.append(eigenstrain_mode(mesh, tissue, name, strain, sigma))
-    return tuple(result)
-
-
-def shape_modes(
-    mesh: TetMesh, tissue: Tissue, gravity: Array, degree: int = 1, sigma: float = 0.1
-) -> tuple[LoadMode, ...]:
-    """Any stretch of the stress-free shape, volume kept or not: six strain components times polynomials of `degree`."""
-    x = lung_coordinates(mesh, gravity)
-    result = []
-    for powers in _powers(degree):
-        weight = np.prod(x ** np.array(powers), axis=1)
-        for i in range(3):
-            for j in range(i, 3):
-                unit = np.zeros((3, 3))
-                unit[i, j] = unit[j, i] = 1 if i == j else 0.5
-                name = "strain {}{} g{} h{} t{}".format("RAS"[i], "RAS"[j], *powers)
-                result.append(eigenstrain_mode(mesh, tissue, name, weight[:, None, None] * unit, sigma))
+    for i in range(3):
+        for j in range(i, 3):
+            unit = np.zeros((3, 3))
+            unit[i, j] = unit[j, i] = 1 if i == j else 0.5
+            strain = np.broadcast_to(unit, (len(mesh.tets), 3, 3))
+            result.append(eigenstrain_mode(mesh, tissue, f"strain {'RAS'[i]}{'RAS'[j]}", strain, sigma))
     return tuple(result)
 
 
@@ -89,8 +60,3 @@ def hilum_modes(mesh: TetMesh, hilum: Array, sigma_mm: float = 3.0, sigma_rad: f
             imposed[hilum] = motion
             result.append(LoadMode(f"{name} {'RAS'[axis]}", np.zeros_like(mesh.points), imposed, sigma))
     return tuple(result)
-
-
-def _powers(degree: int) -> list[tuple[int, int, int]]:
-    span = range(degree + 1)
-    return sorted(((a, b, c) for a in span for b in span for c in span if a + b + c <= degree), key=sum)

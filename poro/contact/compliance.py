@@ -8,8 +8,8 @@ from functools import cached_property
 import numpy as np
 from numba import njit
 
+from poro.arrays import Array
 from poro.linalg.solver import LinearSolver, inverse_at
-from poro.mesh.tetmesh import Array
 
 DOUBLE_UNKNOWNS = 3000
 GROUPS = 128  # of contact nodes: about 2 cm of a lung's surface each
@@ -64,19 +64,10 @@ class Compliance:
         """Motion (k, k) of contact nodes (k,) along directions (k, 3) under unit forces at them along these."""
         return _between(self.matrix, nodes, along)
 
-    def across(self, nodes: Array, along: Array, others: Array, toward: Array) -> Array:
-        """Motion (k, m) of contact nodes (k,) along (k, 3) under unit forces at others (m,) toward (m, 3)."""
-        return _across(self.matrix, nodes, along, others, toward)
-
     def apply(self, force: Array) -> Array:
         """Displacements (nc, 3) of all contact nodes under forces (nc, 3), most of them zero."""
         loaded = np.flatnonzero(force.any(axis=1))
         return _apply(self.matrix, loaded, force[loaded]).reshape(-1, 3)
-
-    def apply_many(self, force: Array) -> Array:
-        """`apply` for many forces (b, nc, 3) at once, a product of matrices, in the matrix's own precision."""
-        flat = force.reshape(len(force), -1).astype(self.matrix.dtype, copy=False) @ self.matrix
-        return flat.astype(float, copy=False).reshape(force.shape)
 
 
 def _bisect(points: Array, groups: int) -> Array:
@@ -98,7 +89,7 @@ def _bisect(points: Array, groups: int) -> Array:
 def _group_means(matrix: Array, label: Array, share: Array) -> Array:
     """Means (3 nc, 3 g) of the columns over the groups; of the rows, rather, the matrix being symmetric.
 
-    Summed in double precision: what rounding adds here looks like slack to the springs, which never comes to rest.
+    Summed in double precision: rounding here would load the geometric stiffness, and contact would not converge.
     """
     sums = np.zeros((3 * len(share), matrix.shape[1]))
     for n in range(len(label)):
@@ -130,21 +121,6 @@ def _between(matrix: Array, nodes: Array, along: Array) -> Array:
         for i in range(start, count):
             for j in range(start, min(start + tile, i)):
                 result[j, i] = result[i, j]
-    return result
-
-
-@njit(cache=True)
-def _across(matrix: Array, nodes: Array, along: Array, others: Array, toward: Array) -> Array:
-    result = np.empty((len(nodes), len(others)))
-    for j in range(len(others)):
-        n, x, y, z = 3 * others[j], toward[j, 0], toward[j, 1], toward[j, 2]
-        first, second, third = matrix[n], matrix[n + 1], matrix[n + 2]
-        for i in range(len(nodes)):
-            total = 0.0
-            for axis in range(3):
-                c = 3 * nodes[i] + axis
-                total += along[i, axis] * (x * first[c] + y * second[c] + z * third[c])
-            result[i, j] = total
     return result
 
 

@@ -8,8 +8,9 @@ import numpy as np
 from numba import njit
 from scipy import ndimage
 
+from poro.arrays import Array
 from poro.mesh.closest import closest_points
-from poro.mesh.tetmesh import Array, TriSurface
+from poro.mesh.tetmesh import TriSurface
 
 
 @dataclass(frozen=True)

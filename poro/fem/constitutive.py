@@ -1,4 +1,4 @@
-"""Tissue laws at finite strain, values that a solver is given. Both agree with linear elasticity at small strain."""
+"""Constitutive models at finite strain, values that a solver is given. Both are linear elasticity at small strain."""
 
 from __future__ import annotations
 
@@ -7,21 +7,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from poro.arrays import Array
 from poro.fem.tissue import Tissue
-from poro.mesh.tetmesh import Array
 
 
 @dataclass(frozen=True)
-class Law:
-    """Hyperelastic law. respond: F (m, 3, 3) -> energy density (m,) kPa, first Piola-Kirchhoff stress (m, 3, 3) kPa and
-    its derivative (m, 3, 3, 3, 3) by F.
+class ConstitutiveModel:
+    """Hyperelastic material. respond: F (m, 3, 3) -> energy density (m,) kPa, first Piola-Kirchhoff stress (m, 3, 3)
+    kPa and its derivative (m, 3, 3, 3, 3) by F.
     """
 
     name: str
     respond: Callable[[Array], tuple[Array, Array, Array]]
 
 
-def saint_venant_kirchhoff(tissue: Tissue) -> Law:
+def saint_venant_kirchhoff(tissue: Tissue) -> ConstitutiveModel:
     """Linear in the Green-Lagrange strain; softens, and in the end buckles, below 58 % of its length."""
     lame, mu = tissue.lame_kpa, tissue.shear_kpa
     eye = np.eye(3)
@@ -39,10 +39,10 @@ def saint_venant_kirchhoff(tissue: Tissue) -> Law:
         energy = lame / 2 * trace**2 + mu * np.einsum("mij,mij->m", e, e)
         return energy, f @ s, moduli
 
-    return Law("Saint Venant-Kirchhoff", respond)
+    return ConstitutiveModel("Saint Venant-Kirchhoff", respond)
 
 
-def neo_hookean(tissue: Tissue) -> Law:
+def neo_hookean(tissue: Tissue) -> ConstitutiveModel:
     """mu/2 (tr C - 3) - mu ln J + lambda/2 (ln J)^2: infinite energy at J = 0, so that no element turns inside out."""
     lame, mu = tissue.lame_kpa, tissue.shear_kpa
     eye = np.eye(3)
@@ -62,4 +62,4 @@ def neo_hookean(tissue: Tissue) -> Law:
         energy = mu / 2 * (np.einsum("mij,mij->m", f, f) - 3) - mu * log + lame / 2 * log**2
         return energy, stress, moduli
 
-    return Law("neo-Hookean", respond)
+    return ConstitutiveModel("neo-Hookean", respond)

@@ -11,11 +11,12 @@ from enum import Enum
 import numpy as np
 from scipy.sparse import coo_matrix
 
-from poro.fem.constraints import springs
+from poro.arrays import Array
+from poro.fem.constraints import point_constraints
 from poro.fem.forms import deformation_gradient
 from poro.fem.solid import solid
 from poro.fem.tissue import Tissue
-from poro.mesh.tetmesh import Array, TetMesh
+from poro.mesh.tetmesh import TetMesh
 
 
 class ExtrapolationStatus(Enum):
@@ -82,9 +83,9 @@ def _continue(mesh: TetMesh, nodes: Array, displacement: Array, tissue: Tissue, 
     if weights is None:
         order = np.argsort(nodes)
         return solid(mesh, tissue, nodes).solve(still, displacement[order])
-    # A weight of 1 makes the spring as stiff as the tissue that one node stands for.
+    # A weight of 1 makes the constraint as stiff as the tissue that one node stands for.
     stiffness = weights * tissue.young_kpa * np.cbrt(mesh.node_volumes[nodes])
     k = len(nodes)
     operator = coo_matrix((np.ones(k), (np.arange(k), nodes)), shape=(k, len(mesh.points))).tocsr()
-    matrix, force = springs(operator, stiffness, displacement)
+    matrix, force = point_constraints(operator, stiffness, displacement)
     return solid(mesh, tissue, np.zeros(0, int), matrix).solve(force)

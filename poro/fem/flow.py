@@ -8,11 +8,12 @@ from functools import cached_property
 import numpy as np
 from scipy.sparse import csr_matrix, diags
 
+from poro.arrays import Array
 from poro.fem.forms import consistent_mass, laplacian
 from poro.fem.tissue import Tissue
 from poro.linalg.dissection import Tree
 from poro.linalg.solver import elimination_tree, linear_solver
-from poro.mesh.tetmesh import Array, TetMesh
+from poro.mesh.tetmesh import TetMesh
 
 
 @dataclass(frozen=True)

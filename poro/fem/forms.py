@@ -9,7 +9,8 @@ import numpy as np
 from numba import njit
 from scipy.sparse import bsr_matrix, coo_matrix, csr_matrix
 
-from poro.mesh.tetmesh import Array, TetMesh
+from poro.arrays import Array
+from poro.mesh.tetmesh import TetMesh
 
 
 def _scatter(mesh: TetMesh, local: Array, rows: int, columns: int) -> csr_matrix:

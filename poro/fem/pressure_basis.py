@@ -1,4 +1,4 @@
-"""Pressure and the displacements it causes at any evacuation rate of one lung, from a basis that grows when it must.
+"""Reduced basis of the pressure: it and the displacements it causes at any evacuation rate of one lung.
 
 Ref: Quarteroni, Manzoni & Negri 2016 (reduced basis, residual as the test).
 """
@@ -11,15 +11,15 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import csr_matrix
 
+from poro.arrays import Array
 from poro.fem.flow import Flow
 from poro.fem.solid import Solid
-from poro.mesh.tetmesh import Array
 
 TOLERANCE = 1e-9  # of the residual relative to the load, for the pressure and for its derivative
 
 
 @dataclass(frozen=True)
-class Sucked:
+class PressureSolution:
     """One evacuation rate. p: (n,) kPa; u: (n, 3) mm without wall; p_change, u_change: derivatives by ln kappa_b."""
 
     p: Array
@@ -28,9 +28,9 @@ class Sucked:
     u_change: Array
 
 
-class Suction:
-    """Pressure drops of the rates met so far span a space; a new rate is solved in it, and whole when a residual shows
-    that it does not suffice. load: (3n, n) nodal forces per kPa.
+class PressureBasis:
+    """Pressure drops of the rates solved so far span a space; a new rate is solved in it, and in full, enriching it,
+    where the residual shows that it does not suffice. load: (3n, n) nodal forces per kPa.
     """
 
     def __init__(self, flow: Flow, solid: Solid, load: csr_matrix) -> None:
@@ -45,7 +45,7 @@ class Suction:
         """Number of pressure fields in the basis."""
         return self._basis.shape[1]
 
-    def at(self, kappa_b: float) -> Sucked:
+    def solve(self, kappa_b: float) -> PressureSolution:
         """The lung at kappa_b in 1/(Pa s); raises ValueError for a negative one."""
         drop, steepening = self._coefficients(kappa_b).T
         p = np.full(len(self._flow.mesh.points), self._flow.tissue.pleural_kpa)
@@ -53,15 +53,15 @@ class Suction:
         p[self._flow.inner] -= self._basis @ drop
         change[self._flow.inner] -= self._basis @ steepening
         response = self._responses()
-        return Sucked(p, change, response @ drop, response @ steepening)
+        return PressureSolution(p, change, response @ drop, response @ steepening)
 
-    def learn(self, rates: Iterable[float]) -> None:
-        """Let the basis grow for several kappa_b, so that one elastic solution serves them together."""
+    def enrich(self, rates: Iterable[float]) -> None:
+        """Enrich the basis for several kappa_b, so that one elastic solution serves them together."""
         for kappa_b in rates:
             self._coefficients(kappa_b)
 
     def _coefficients(self, kappa_b: float) -> Array:
-        """Coefficients (r, 2) of the drop and of its derivative in the basis, which grows where it does not suffice."""
+        """Coefficients (r, 2) of the drop and of its derivative in the basis, enriched where it does not suffice."""
         found = self._reduced(kappa_b)
         if found is None:
             p, change = self._flow.pressure(kappa_b)

@@ -7,10 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import csr_matrix
 
+from poro.arrays import Array
 from poro.fem.forms import stiffness
 from poro.fem.tissue import Tissue
 from poro.linalg.solver import LinearSolver, linear_solver
-from poro.mesh.tetmesh import Array, TetMesh
+from poro.mesh.tetmesh import TetMesh
 
 
 @dataclass(frozen=True)
@@ -48,16 +49,16 @@ def _centred(points: Array) -> Array:
     return points - points.mean(axis=0) if len(points) else np.zeros((1, 3))
 
 
-def solid(mesh: TetMesh, tissue: Tissue, fixed: Array, springs: csr_matrix | None = None) -> Solid:
-    """Factorize the elastic stiffness, plus optional springs (3n, 3n) kPa mm, with the nodes `fixed` held.
+def solid(mesh: TetMesh, tissue: Tissue, fixed: Array, constraints: csr_matrix | None = None) -> Solid:
+    """Factorize the elastic stiffness, plus that of optional point constraints (3n, 3n) kPa mm, with `fixed` held.
 
-    Raises ValueError when neither fixed nodes nor springs hold the body.
+    Raises ValueError when neither fixed nodes nor constraints hold the body, SolverError when they do not suffice.
     """
-    if springs is None and np.linalg.matrix_rank(_centred(mesh.points[fixed]), tol=1e-6) < 2:
+    if constraints is None and np.linalg.matrix_rank(_centred(mesh.points[fixed]), tol=1e-6) < 2:
         raise ValueError(f"{len(np.unique(fixed))} held nodes let the body move freely; hold three that span a plane")
     matrix = stiffness(mesh, tissue.lame_kpa, tissue.shear_kpa)
-    if springs is not None:
-        matrix = (matrix + springs).tocsr()
+    if constraints is not None:
+        matrix = (matrix + constraints).tocsr()
     fixed = np.unique(fixed).astype(np.int64)
     free = np.setdiff1d(np.arange(len(mesh.points)), fixed)
     rows = unknowns_of(free)

@@ -38,11 +38,6 @@ class Tissue:
         return self.young_kpa / (2 * (1 + self.poisson))
 
     @property
-    def bulk_kpa(self) -> float:
-        """Bulk modulus."""
-        return self.lame_kpa + 2 * self.shear_kpa / 3
-
-    @property
     def mobility(self) -> float:
         """kappa / mu_f in mm2/(Pa s), so that mobility / kappa_b is the layer thickness squared."""
         return self.permeability_m2 / self.viscosity_pa_s * 1e6

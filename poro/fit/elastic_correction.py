@@ -1,5 +1,4 @@
-"""Residual registration held to mechanics: the elastic field of least energy that brings a solved lung nearer to the
-data.
+"""Elastic correction: the elastic field of least energy that brings a solved lung nearer to the data.
 
 The parameters of a model say how a lung deforms in the large; what they leave is smooth, and inner points say what it
 is.
@@ -12,22 +11,29 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import diags
 
-from poro.fem.constraints import point_operator, springs
+from poro.arrays import Array
+from poro.fem.constraints import interpolation_matrix, point_constraints
 from poro.fem.forms import deformation_gradient
 from poro.fem.solid import solid
 from poro.fem.tissue import Tissue
 from poro.fit.observations import Target, independence
+from poro.fit.problem import FitSettings
 from poro.mesh.closest import closest_points
 from poro.mesh.locate import Location, locate
-from poro.mesh.tetmesh import Array, TetMesh
+from poro.mesh.tetmesh import TetMesh
 
 REGION_MM3 = 1e5
+REACH_MM = 20.0
+KEYPOINT_SHARE = 0.75
+"""Of a keypoint's standard deviation in the fit: that holds what few parameters cannot follow too, which the correction
+can. Chosen (1.5 mm beside 2 mm), not derived."""
 
 
 @dataclass(frozen=True)
-class Pull:
-    """Springs at points of a lung. points: (q, 3) mm at rest; offset: (q, 3) mm wanted on top of the solved state;
-    sigma_mm: (q,) uncertainty; normals: (q, 3) unit vectors along which alone a spring acts, zero for all directions.
+class PointConstraints:
+    """Where points of a lung should go. points: (q, 3) mm at rest; offset: (q, 3) mm wanted on top of the solved state;
+    sigma_mm: (q,) uncertainty; normals: (q, 3) unit vectors along which alone a constraint acts, zero for all
+    directions.
     """
 
     points: Array
@@ -37,80 +43,77 @@ class Pull:
 
 
 @dataclass(frozen=True)
-class Correction:
+class ElasticCorrection:
     """Elastic displacement on top of a solved state.
 
-    u: (n, 3) mm; det_f: (m,) of both together; misfit_mm, influence: (q,) what remains at the springs and how far
-    each is believed, 0..1.
+    u: (n, 3) mm; det_f: (m,) of both together; influence: (q,) how far each constraint is believed, 0..1.
     """
 
     u: Array
     det_f: Array
-    misfit_mm: Array
     influence: Array
 
 
-def pull_of(
-    target: Target,
-    mesh: TetMesh,
-    u: Array,
-    surface_sigma_mm: float = 2.0,
-    keypoint_sigma_mm: float = 1.5,
-    correlation_mm: float = 15.0,
-    reach_mm: float = 20.0,
-) -> Pull:
-    """Springs from a solved state (n, 3) to a target: along the normal at the surface, in all directions at inner
-    points.
+def constraints_to(target: Target, mesh: TetMesh, u: Array, settings: FitSettings) -> PointConstraints:
+    """Constraints from a solved state (n, 3) to a target: along the normal at the surface, in all directions at inner
+    points. Standard deviations and correlation of the data are those of the fit's settings, but for KEYPOINT_SHARE.
 
-    Surface points farther than `reach_mm` from the solved surface, or facing another way, are left out.
+    Surface points farther than REACH_MM from the solved surface, or facing another way, are left out.
     """
     boundary = mesh.boundary
     moved = boundary.moved(boundary.points + u[boundary.nodes])
     near = closest_points(moved, target.points)
     agree = np.einsum("td,td->t", moved.normals[near.triangle], target.normals)
-    used = np.flatnonzero((agree > 0.5) & (np.abs(near.distance) < reach_mm) & (target.weights > 0))
+    used = np.flatnonzero((agree > 0.5) & (np.abs(near.distance) < REACH_MM) & (target.weights > 0))
     corners = boundary.points[boundary.triangles[near.triangle[used]]]
     rest = np.einsum("qk,qkd->qd", near.barycentric[used], corners)
-    share = target.weights[used] * independence(target.points[used], correlation_mm)
+    share = target.weights[used] * independence(target.points[used], settings.correlation_mm)
     inner = target.inflated[target.keypoint_weights > 0]
     where = locate(mesh, inner)
-    now = inner + point_operator(where, len(u)) @ u
+    now = inner + interpolation_matrix(where, len(u)) @ u
     trust = target.keypoint_weights[target.keypoint_weights > 0]
-    return Pull(
+    keypoint_sigma_mm = KEYPOINT_SHARE * settings.keypoint_sigma_mm
+    return PointConstraints(
         np.concatenate([rest, inner]),
         np.concatenate([(target.points - near.points)[used], target.deflated[target.keypoint_weights > 0] - now]),
-        np.concatenate([surface_sigma_mm / np.sqrt(share), keypoint_sigma_mm / np.sqrt(trust)]),
+        np.concatenate([settings.surface_sigma_mm / np.sqrt(share), keypoint_sigma_mm / np.sqrt(trust)]),
         np.concatenate([target.normals[used], np.zeros_like(inner)]),
     )
 
 
-def correct(
-    mesh: TetMesh, u: Array, tissue: Tissue, pull: Pull, model_sigma: float = 0.05, robust: float = 3.0, rounds: int = 5
-) -> Correction:
-    """Elastic field of least energy that follows the springs, outliers losing influence (Cauchy).
+def elastic_correction(
+    mesh: TetMesh,
+    u: Array,
+    tissue: Tissue,
+    wanted: PointConstraints,
+    model_sigma: float = 0.05,
+    robust: float = 3.0,
+    rounds: int = 5,
+) -> ElasticCorrection:
+    """Elastic field of least energy that follows the constraints, outliers losing influence (Cauchy).
 
     model_sigma: strain by which a tenth of a litre of the solved state is expected to be wrong; it weighs the
-    tissue's energy against the springs. The field starts stiff and is loosened round by round, so that outliers show
-    before they are followed.
+    tissue's energy against the constraints. The field starts stiff and is loosened round by round, so that outliers
+    show before they are followed.
     """
-    where = locate(mesh, pull.points)
-    operator = point_operator(where, len(u))
-    axial = np.linalg.norm(pull.normals, axis=1) > 0.5
-    shape = np.where(axial[:, None, None], pull.normals[:, :, None] * pull.normals[:, None, :], np.eye(3))
-    # What holds the body where no spring does; far below any tissue stiffness.
+    where = locate(mesh, wanted.points)
+    operator = interpolation_matrix(where, len(u))
+    axial = np.linalg.norm(wanted.normals, axis=1) > 0.5
+    shape = np.where(axial[:, None, None], wanted.normals[:, :, None] * wanted.normals[:, None, :], np.eye(3))
+    # What holds the body where no constraint does; far below any tissue stiffness.
     anchor = diags(np.repeat(1e-6 * tissue.young_kpa * np.cbrt(mesh.node_volumes), 3)).tocsr()
     influence = _near(where)
     field = np.zeros_like(u)
     for number in range(rounds):
         unit = tissue.young_kpa * REGION_MM3 * (model_sigma / 2.0 ** (rounds - 1 - number)) ** 2
-        stiffness = (unit * influence / pull.sigma_mm**2)[:, None, None] * shape
-        matrix, force = springs(operator, stiffness, pull.offset)
+        penalty = (unit * influence / wanted.sigma_mm**2)[:, None, None] * shape
+        matrix, force = point_constraints(operator, penalty, wanted.offset)
         field = solid(mesh, tissue, np.zeros(0, int), (matrix + anchor).tocsr()).solve(force)
-        misfit = np.linalg.norm(np.einsum("qij,qj->qi", shape, pull.offset - operator @ field), axis=1)
-        scale = robust * np.maximum(pull.sigma_mm, 1.4826 * np.median(misfit[influence > 0]))
+        misfit = np.linalg.norm(np.einsum("qij,qj->qi", shape, wanted.offset - operator @ field), axis=1)
+        scale = robust * np.maximum(wanted.sigma_mm, 1.4826 * np.median(misfit[influence > 0]))
         influence = _near(where) / (1 + (misfit / scale) ** 2)
     det_f = np.linalg.det(deformation_gradient(mesh, u + field))
-    return Correction(field, det_f, misfit, influence)
+    return ElasticCorrection(field, det_f, influence)
 
 
 def _near(where: Location) -> Array:

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from poro.arrays import Array
 from poro.collapse.model import PoroSystem
-from poro.fit.trust_region import REACH, Fit, bounds
-from poro.mesh.tetmesh import Array
+from poro.fit.collapse_fit import Fit
+from poro.fit.problem import STEP_SCALE, bounds
 
 THETA_NAMES = ("log10 kappa_b", "phi", "d_diaph_mm")
 AT_BOUND = 1e-3  # share of a parameter's range within which it counts as at its bound
@@ -46,7 +47,7 @@ class Identifiability:
 def identifiability(result: Fit, system: PoroSystem) -> Identifiability:
     """From a fit's covariance; parameters that were held are left out."""
     names, moved = [*THETA_NAMES, *(mode.name for mode in system.modes)], result.free
-    unit = np.concatenate([REACH, [3 * mode.sigma for mode in system.modes]])
+    unit = np.concatenate([STEP_SCALE, [3 * mode.sigma for mode in system.modes]])
     information = np.linalg.inv(result.covariance)[np.ix_(moved, moved)]
     covariance, unit = np.linalg.inv(information), unit[moved]
     sigma = np.sqrt(np.diag(covariance))

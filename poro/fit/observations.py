@@ -8,9 +8,10 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial import cKDTree
 
+from poro.arrays import Array
 from poro.mesh.closest import closest_points
 from poro.mesh.locate import Location, interpolate, locate
-from poro.mesh.tetmesh import Array, TetMesh
+from poro.mesh.tetmesh import TetMesh
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from collections import deque
 
 import numpy as np
 
-from poro.mesh.tetmesh import Array
+from poro.arrays import Array
 
 DEPTH = 5
 
@@ -17,7 +17,7 @@ class Anderson:
     def __init__(self) -> None:
         self._seen: deque[tuple[Array, tuple[Array, ...]]] = deque(maxlen=DEPTH + 1)
 
-    def forget(self) -> None:
+    def restart(self) -> None:
         """Start anew, after something other than the iterate has changed."""
         self._seen.clear()
 

@@ -10,8 +10,9 @@ from numba import njit
 from scipy.linalg import blas, lapack
 from scipy.sparse import csr_matrix
 
+from poro.arrays import Array
+from poro.errors import SolverError
 from poro.linalg.dissection import Front, Tree
-from poro.mesh.tetmesh import Array
 
 STRIP = 512  # rows of an inverse that are added at a time, to keep what is in between small
 
@@ -103,7 +104,7 @@ class Cholesky:
 def cholesky(matrix: csr_matrix, tree: Tree, block: int) -> Cholesky:
     """Factor a symmetric positive definite matrix (n * block, n * block) along an elimination tree.
 
-    Raises ValueError when a pivot is not positive, that is when the body can still move freely.
+    Raises SolverError when a pivot is not positive, that is when the body can still move freely.
     """
     order = _unknowns(tree.order, block)
     permuted = csr_matrix(matrix)[order][:, order]
@@ -114,7 +115,7 @@ def cholesky(matrix: csr_matrix, tree: Tree, block: int) -> Cholesky:
         n = (front.last - front.first) * block
         lower, info = lapack.dpotrf(dense[:n, :n], lower=1)
         if info:
-            raise ValueError("matrix is not positive definite; the body can move freely, fix at least three nodes")
+            raise SolverError("matrix is not positive definite; the body can move freely, fix at least three nodes")
         inverse, _ = lapack.dtrtri(lower, lower=1)
         inverse = np.ascontiguousarray(np.tril(inverse))
         below = dense[n:, :n] @ inverse.T

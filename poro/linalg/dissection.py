@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import csr_matrix
 
-from poro.mesh.tetmesh import Array
+from poro.arrays import Array
 
 
 @dataclass(frozen=True)

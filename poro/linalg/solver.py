@@ -11,12 +11,14 @@ import numpy as np
 import pyamg
 from scipy.sparse import bsr_matrix, csr_matrix
 
+from poro.arrays import Array
+from poro.errors import SolverError
 from poro.linalg.cholesky import Cholesky, cholesky
 from poro.linalg.dissection import Tree, dissect
-from poro.mesh.tetmesh import Array
 
 # Numbers in a factor above which memory (8 bytes each) decides for the iterative solver.
 FACTOR_LIMIT = 150_000_000
+MAX_ITERATIONS = 200  # of multigrid
 
 
 class LinearSolver(Protocol):
@@ -29,7 +31,10 @@ class LinearSolver(Protocol):
 
 @dataclass(frozen=True)
 class Multigrid:
-    """Conjugate gradients preconditioned by smoothed aggregation; stops at a relative residual of `tolerance`."""
+    """Conjugate gradients preconditioned by smoothed aggregation; stops at a relative residual of `tolerance`.
+
+    residuals: norms of the last right-hand side's iterations, the first before any.
+    """
 
     matrix: bsr_matrix
     hierarchy: Any
@@ -37,7 +42,7 @@ class Multigrid:
     residuals: list[float] = field(default_factory=list)
 
     def solve(self, right: Array) -> Array:
-        """Solution of the shape of `right`; raises RuntimeError when 200 iterations do not suffice."""
+        """Solution of the shape of `right`; raises SolverError when MAX_ITERATIONS do not suffice."""
         columns = [self._solve_one(b) for b in np.atleast_2d(right.T)]
         return columns[0] if right.ndim == 1 else np.stack(columns, axis=1)
 
@@ -46,14 +51,18 @@ class Multigrid:
             return np.zeros_like(right)
         self.residuals.clear()
         x, info = self.hierarchy.solve(
-            right, tol=self.tolerance, accel="cg", maxiter=200, residuals=self.residuals, return_info=True
+            right, tol=self.tolerance, accel="cg", maxiter=MAX_ITERATIONS, residuals=self.residuals, return_info=True
         )
         if info:
-            raise RuntimeError(f"multigrid stopped at residual {self.residuals[-1]:.1e} after 200 iterations")
+            relative = tuple(float(r / self.residuals[0]) for r in self.residuals)
+            raise SolverError(
+                f"multigrid stopped at a relative residual of {relative[-1]:.1e} after {MAX_ITERATIONS} iterations",
+                relative,
+            )
         return x
 
 
-def rigid_modes(points: Array) -> Array:
+def rigid_body_modes(points: Array) -> Array:
     """Three translations and three rotations at points (n, 3), as columns (3n, 6)."""
     modes = np.zeros((len(points), 3, 6))
     modes[:, :, :3] = np.eye(3)
@@ -80,7 +89,7 @@ def linear_solver(
     tree = tree or elimination_tree(matrix, points)
     if tree.factor_entries(block) <= limit:
         return cholesky(matrix, tree, block)
-    near_null = rigid_modes(points) if block == 3 else np.ones((len(points), 1))
+    near_null = rigid_body_modes(points) if block == 3 else np.ones((len(points), 1))
     blocked = bsr_matrix(matrix, blocksize=(block, block))
     hierarchy = pyamg.smoothed_aggregation_solver(
         blocked, B=near_null, strength=("symmetric", {"theta": 0.0}), max_coarse=300

@@ -8,10 +8,9 @@ from numpy.testing import assert_allclose
 from scipy.sparse import diags
 from shapes import box, ellipsoid, order
 
-from poro.fem.flow import Flow
+from poro.fem import Flow, Tissue
 from poro.fem.forms import consistent_mass, laplacian
-from poro.fem.tissue import Tissue
-from poro.linalg.solver import linear_solver
+from poro.linalg import linear_solver
 from poro.mesh import TetMesh, stuff_level_set
 
 TISSUE = Tissue()

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from poro.fem.tissue import Tissue
+from poro.fem import Tissue
 from poro.mesh import TetMesh
 from registration.rigid import RigidTransform
 from vatsloc.case import read_case

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from poro.fit.trust_region import FitStatus
+from poro.fit import FitStatus
 from poro.mesh import TetMesh
 from registration.ffd import FfdSettings, Weights
 from registration.resample import resample

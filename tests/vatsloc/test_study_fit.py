@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from poro.collapse.model import PoroSystem, Theta, assemble, solve
-from poro.fem.tissue import Tissue
+from poro.collapse import PoroSystem, Theta, assemble, solve
+from poro.fem import Tissue
+from poro.fit import Target
 from poro.fit.identifiability import THETA_NAMES
-from poro.fit.observations import Target
 from poro.mesh import stuff_level_set
 from vatsloc.imaging.surface import Border, SurfacePoints
 from vatsloc.study.stability_fit import DISTURBANCES, identifiability, page, random_starts

@@ -10,12 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from poro.collapse.model import PoroSystem, Theta, solve, solve_many, without_wall
-from poro.fem.tissue import Tissue
-from poro.mesh.tetmesh import Array
+from poro.arrays import Array
+from poro.collapse import PoroSystem, Theta, solve
+from poro.collapse.model import without_wall
+from poro.fem import Tissue
 from vatsloc.study.cost_poro import STAGES, cost_rows, measure_sizes, warm
 from vatsloc.study.getfem_peer import GetfemAnswer, getfem_python, run_getfem
 from vatsloc.study.poro_lung import Lung, lung, smooth_wall, system_of
+from vatsloc.study.sweep import solve_many
 from vatsloc.study.tables import Row, markdown
 
 COMPARED_TETS = 28_000
@@ -92,7 +94,7 @@ def _our_seconds(body: Lung, thetas: list[Theta], chosen: list[Theta]) -> tuple[
 
     system = timed("set-up", lambda: system_of(body, _TISSUE, smooth_wall()))
     timed("without wall, first", lambda: without_wall(system, thetas[0]))
-    timed("compliance", lambda: system.compliance.groups(system.obstacle.rest))
+    timed("compliance", lambda: system.compliance.groups(system.wall.rest))
     timed("with wall, first", lambda: solve(system, thetas[0]))
     # Every value is new to the lung, and contact starts from none.
     for name, work in (("without wall", without_wall), ("with wall", solve)):

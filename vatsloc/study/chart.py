@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from poro.fit.trust_region import FitStatus
+from poro.fit import FitStatus
 from registration.rigid import RigidTransform
 from registration.volume import Array
 from vatsloc.case import Case, read_case

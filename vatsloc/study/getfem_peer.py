@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-from poro.collapse.model import PoroSystem, Theta
+from poro.arrays import Array
+from poro.collapse import PoroSystem, Theta
 from poro.fem.tissue import GRAVITY_KPA_PER_MM
-from poro.mesh.tetmesh import Array
 from vatsloc.errors import VatslocError
 from vatsloc.study.poro_lung import WALL
 
@@ -50,8 +50,8 @@ def run_getfem(python: str, system: PoroSystem, thetas: list[Theta]) -> GetfemAn
     """Solve a system in front of `WALL` at several parameter values by GetFEM; raises VatslocError when it fails."""
     mesh, tissue, n = system.mesh, system.tissue, len(system.mesh.points)
     offset, moving, pull = np.zeros(n), np.zeros((n, 3)), np.zeros((n, 3))
-    offset[system.contact_nodes] = system.obstacle.offset
-    moving[system.contact_nodes] = system.obstacle.moving[:, None] * system.obstacle.axis
+    offset[system.contact_nodes] = system.wall.offset
+    moving[system.contact_nodes] = system.wall.moving[:, None] * system.wall.axis
     pull[system.hilum] = system.hilum_displacement
     with tempfile.TemporaryDirectory() as folder:
         source, target = Path(folder) / "problem.npz", Path(folder) / "answer.npz"

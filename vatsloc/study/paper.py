@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from poro.fit.trust_region import FitStatus
+from poro.fit import FitStatus
 from vatsloc.case import Case, read_case
 from vatsloc.errors import VatslocError
 from vatsloc.evaluation.inputs import Truth, read_truth

@@ -10,14 +10,13 @@ from pathlib import Path
 
 import numpy as np
 
+from poro.arrays import Array
+from poro.collapse import Theta, solve
 from poro.collapse.choice import finite_problem
 from poro.collapse.finite_strain import deform
-from poro.collapse.model import Theta, solve, without_wall
-from poro.fem.constitutive import neo_hookean
-from poro.fem.flow import Flow
+from poro.collapse.model import without_wall
+from poro.fem import Flow, Tissue, neo_hookean
 from poro.fem.forms import deformation_gradient
-from poro.fem.tissue import Tissue
-from poro.mesh.tetmesh import Array
 from vatsloc.study.poro_lung import HILUM_CENTRE, Lung, lung, smooth_wall, system_of
 from vatsloc.study.stability_poro_contact import contact_meshes, contact_methods
 from vatsloc.study.stability_poro_mesh import slivers, towards_incompressible

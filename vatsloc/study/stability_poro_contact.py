@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from scipy.sparse import bsr_matrix
 
-from poro.collapse.model import PoroState, PoroSystem, Theta, solve
-from poro.fem.solid import solid
-from poro.fem.tissue import GRAVITY_KPA_PER_MM, Tissue
+from poro.collapse import PoroState, PoroSystem, Theta, solve
+from poro.fem import Tissue, solid
+from poro.fem.tissue import GRAVITY_KPA_PER_MM
 from poro.mesh import interpolate, locate
 from vatsloc.study.poro_lung import lung, smooth_wall, system_of
 from vatsloc.study.tables import Row
@@ -85,7 +85,7 @@ def _pressed(system: PoroSystem, state: PoroState) -> Row:
 
 def _penalty(system: PoroSystem, theta: Theta, stiffness: float, most: int = 40) -> tuple[Any, int, float]:
     """Displacements, iterations (`most` when it cycles) and smallest gap under springs of stiffness kPa/mm."""
-    mesh, nodes, obstacle = system.mesh, system.contact_nodes, system.obstacle
+    mesh, nodes, obstacle = system.mesh, system.contact_nodes, system.wall
     p, _ = system.flow.pressure(theta.kappa_b)
     load = (system.pressure_load @ p).reshape(-1, 3)
     load = load + mesh.node_volumes[:, None] * system.gravity * GRAVITY_KPA_PER_MM * system.tissue.density(theta.phi)

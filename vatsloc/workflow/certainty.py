@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from poro.fit.trust_region import ellipsoid95, point_covariance
+from poro.fit import ellipsoid95, point_covariance
 from poro.mesh import interpolate, locate
 from registration.volume import Array
 from vatsloc.workflow.pneumothorax import Collapse

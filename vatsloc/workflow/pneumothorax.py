@@ -6,9 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from poro.collapse.model import PoroSystem
-from poro.fit.identifiability import Identifiability, identifiability
-from poro.fit.trust_region import Fit
+from poro.collapse import PoroSystem
+from poro.fit import Fit, Identifiability, identifiability
 from poro.mesh import TetMesh, TriSurface, interpolate, locate
 from registration.rigid import RigidTransform
 from registration.volume import Array
@@ -65,7 +64,7 @@ class Collapse:
         return self.model.fit
 
     @property
-    def known(self) -> Identifiability:
+    def identifiability(self) -> Identifiability:
         """What the observations tell of each parameter."""
         return identifiability(self.fit, self.system)
 

@@ -9,8 +9,7 @@ from functools import partial
 import numpy as np
 from scipy import ndimage
 
-from poro.fem.extrapolation import Extrapolation, extrapolate
-from poro.fem.tissue import Tissue
+from poro.fem import Extrapolation, Tissue, extrapolate
 from poro.mesh import TetMesh, stuff
 from registration.ffd import FfdFit, FfdSettings, Weights
 from registration.field import PointMap

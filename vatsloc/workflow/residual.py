@@ -13,8 +13,7 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from poro.fem.extrapolation import extrapolate
-from poro.fem.tissue import Tissue
+from poro.fem import Tissue, extrapolate
 from poro.mesh import TetMesh
 from registration.ffd import FfdSettings, Weights, register_ffd
 from registration.inversion import invert_at

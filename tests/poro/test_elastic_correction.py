@@ -6,9 +6,9 @@ import numpy as np
 from numpy.testing import assert_allclose
 from shapes import ellipsoid
 
-from poro.fem.tissue import Tissue
-from poro.fit.elastic_correction import Pull, correct, pull_of
-from poro.fit.observations import Target
+from poro.fem import Tissue
+from poro.fit import FitSettings, Target, constraints_to, elastic_correction
+from poro.fit.elastic_correction import PointConstraints
 from poro.mesh import interpolate, locate
 
 TISSUE = Tissue()
@@ -26,8 +26,8 @@ def test_correction_recovers_a_smooth_residual_and_ignores_outliers() -> None:
     inside = rng.uniform(-25, 25, (120, 3))
     wanted = hidden(inside)
     wanted[:10] += rng.normal(size=(10, 3)) * 30
-    pull = Pull(inside, wanted, np.full(120, 0.5), np.zeros((120, 3)))
-    found = correct(mesh, u, TISSUE, pull)
+    constraints = PointConstraints(inside, wanted, np.full(120, 0.5), np.zeros((120, 3)))
+    found = elastic_correction(mesh, u, TISSUE, constraints)
     fresh = rng.uniform(-25, 25, (200, 3))
     left = interpolate(locate(mesh, fresh), found.u) - hidden(fresh)
     assert np.linalg.norm(left, axis=1).mean() < 0.25 * np.linalg.norm(hidden(fresh), axis=1).mean()
@@ -36,19 +36,19 @@ def test_correction_recovers_a_smooth_residual_and_ignores_outliers() -> None:
     assert found.det_f.min() > 0.5
 
 
-def test_normal_springs_leave_sliding_free() -> None:
+def test_normal_constraints_leave_sliding_free() -> None:
     mesh = ellipsoid(12.0)
     s = mesh.boundary
-    pull = Pull(
+    constraints = PointConstraints(
         s.points, np.broadcast_to([0.0, 4.0, 0.0], s.points.shape).copy(), np.full(len(s.points), 1.0), s.node_normals
     )
-    found = correct(mesh, np.zeros_like(mesh.points), TISSUE, pull, robust=np.inf, rounds=1)
+    found = elastic_correction(mesh, np.zeros_like(mesh.points), TISSUE, constraints, robust=np.inf, rounds=1)
     assert_allclose(found.u.mean(axis=0), [0, 4, 0], atol=0.2)
     along = np.einsum("nd,nd->n", found.u[s.nodes] - [0, 4, 0], s.node_normals)
     assert np.abs(along).max() < 0.4
 
 
-def test_a_moved_target_pulls_the_lung_onto_itself() -> None:
+def test_a_moved_target_draws_the_lung_onto_itself() -> None:
     mesh = ellipsoid(10.0)
     s = mesh.boundary
     u = mesh.points @ GRADIENT.T
@@ -58,9 +58,9 @@ def test_a_moved_target_pulls_the_lung_onto_itself() -> None:
     target = Target(
         moved.points, moved.node_normals, np.ones(len(s.points)), x, x + x @ GRADIENT.T + shift, np.ones(30)
     )
-    pull = pull_of(target, mesh, u)
-    assert_allclose(pull.offset[-30:], np.broadcast_to(shift, (30, 3)), atol=1e-9)
-    found = correct(mesh, u, TISSUE, pull)
+    constraints = constraints_to(target, mesh, u, FitSettings())
+    assert_allclose(constraints.offset[-30:], np.broadcast_to(shift, (30, 3)), atol=1e-9)
+    found = elastic_correction(mesh, u, TISSUE, constraints)
     left = np.linalg.norm(found.u - shift, axis=1)
     assert left.mean() < 0.25
     assert left.max() < 0.8

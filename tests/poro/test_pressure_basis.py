@@ -1,4 +1,4 @@
-"""The reduced basis of pressures against whole solutions, and many lungs against one at a time."""
+"""The reduced basis of pressures against whole solutions."""
 
 from __future__ import annotations
 
@@ -7,11 +7,9 @@ import pytest
 from numpy.testing import assert_allclose
 from shapes import ellipsoid
 
-from poro.collapse.model import PoroStatus, PoroSystem, Theta, assemble, solve, solve_many
-from poro.fem.pressure_basis import Suction
-from poro.fem.solid import Solid
-from poro.fem.tissue import Tissue
-from poro.mesh.tetmesh import Array
+from poro.arrays import Array
+from poro.collapse import PoroSystem, assemble
+from poro.fem import PressureBasis, Solid, Tissue
 
 
 @pytest.fixture(scope="module")
@@ -22,13 +20,13 @@ def system() -> PoroSystem:
 
 
 def test_basis_gives_whole_solutions_and_stops_growing(system: PoroSystem) -> None:
-    suction, flow = system.suction, system.flow
+    basis, flow = system.pressure_basis, system.flow
     for kappa_b in np.geomspace(1e-14, 1e-4, 30):
-        suction.at(kappa_b)
-    known = suction.size
+        basis.solve(kappa_b)
+    known = basis.size
     assert known < 60
     for kappa_b in 10 ** np.random.default_rng(0).uniform(-13, -5, 12):
-        found = suction.at(kappa_b)
+        found = basis.solve(kappa_b)
         p, change = flow.pressure(kappa_b)
         drop = np.abs(p - system.tissue.pleural_kpa).max()
         assert_allclose(found.p, p, atol=1e-8 * drop)
@@ -37,32 +35,20 @@ def test_basis_gives_whole_solutions_and_stops_growing(system: PoroSystem) -> No
         assert_allclose(found.u, u, atol=1e-7 * np.abs(u).max())
         du = system.solid.solve((system.pressure_load @ change).reshape(-1, 3))
         assert_allclose(found.u_change, du, atol=1e-7 * np.abs(u).max())
-    assert suction.size - known < 12
+    assert basis.size - known < 12
 
 
-def test_no_evacuation_sucks_nothing(system: PoroSystem) -> None:
-    still = system.suction.at(0.0)
+def test_no_evacuation_leaves_the_pleural_pressure(system: PoroSystem) -> None:
+    still = system.pressure_basis.solve(0.0)
     assert_allclose(still.p, system.tissue.pleural_kpa, rtol=1e-14)
     assert_allclose(still.u, 0, atol=1e-12)
     with pytest.raises(ValueError, match="kappa_b must be 0 or more"):
-        system.suction.at(-1e-9)
+        system.pressure_basis.solve(-1e-9)
 
 
-def test_many_lungs_equal_lungs_one_by_one(system: PoroSystem) -> None:
-    rng = np.random.default_rng(1)
-    thetas = [Theta(10 ** rng.uniform(-10, -7.5), rng.uniform(0.7, 0.9), rng.uniform(0, 8)) for _ in range(6)]
-    for theta, state in zip(thetas, solve_many(system, thetas, 1e-7), strict=True):
-        alone = solve(system, theta, tolerance_mm=1e-7)
-        assert state.status is PoroStatus.SOLVED
-        assert state.theta is theta
-        assert_allclose(state.u, alone.u, atol=1e-5)
-        assert_allclose(state.p, alone.p, atol=1e-9)
-        assert (state.active == alone.active).all()
-
-
-def test_rates_learnt_together_take_one_elastic_solution(system: PoroSystem, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rates_added_together_take_one_elastic_solution(system: PoroSystem, monkeypatch: pytest.MonkeyPatch) -> None:
     rates = (1e-9, 1e-8, 1e-7)
-    alone = [Suction(system.flow, system.solid, system.pressure_load).at(kappa_b) for kappa_b in rates]
+    alone = [PressureBasis(system.flow, system.solid, system.pressure_load).solve(kappa_b) for kappa_b in rates]
     solved: list[int] = []
     plain = Solid.solve
 
@@ -71,11 +57,11 @@ def test_rates_learnt_together_take_one_elastic_solution(system: PoroSystem, mon
         return plain(self, force, imposed)
 
     monkeypatch.setattr(Solid, "solve", counted)
-    together = Suction(system.flow, system.solid, system.pressure_load)
-    together.learn(rates)
+    together = PressureBasis(system.flow, system.solid, system.pressure_load)
+    together.enrich(rates)
     assert together.size == 6
     for kappa_b, one in zip(rates, alone, strict=True):
-        found = together.at(kappa_b)
+        found = together.solve(kappa_b)
         assert_allclose(found.u, one.u, atol=1e-8 * np.abs(one.u).max())
         assert_allclose(found.u_change, one.u_change, atol=1e-7 * np.abs(one.u_change).max())
     assert solved == [6]

@@ -1,5 +1,5 @@
 """Elastic continuation: exact on affine data, soft tends to exact, inverted elements are caught, corrections obey
-springs.
+point constraints.
 """
 
 from __future__ import annotations
@@ -9,8 +9,8 @@ import pytest
 from numpy.testing import assert_allclose
 from shapes import ellipsoid
 
-from poro.fem.extrapolation import ExtrapolationStatus, extrapolate
-from poro.fem.tissue import Tissue
+from poro.fem import Tissue, extrapolate
+from poro.fem.extrapolation import ExtrapolationStatus
 
 TISSUE = Tissue()
 GRADIENT = np.array([[-0.1, 0.02, 0.0], [0.03, -0.05, 0.04], [0.0, -0.02, 0.08]])
