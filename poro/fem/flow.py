@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.sparse import csr_matrix, diags
+from scipy.sparse import csr_matrix
 
 from poro.arrays import Array
-from poro.fem.forms import consistent_mass, laplacian
+from poro.fem.forms import consistent_mass, laplacian, lumped_mass
 from poro.fem.tissue import Tissue
 from poro.linalg.dissection import Tree
 from poro.linalg.solver import elimination_tree, linear_solver
@@ -37,7 +37,7 @@ class Flow:
 
     @cached_property
     def _rows(self) -> tuple[csr_matrix, csr_matrix]:
-        mass = diags(self.mesh.node_volumes).tocsr() if self.lumped else consistent_mass(self.mesh)
+        mass = lumped_mass(self.mesh) if self.lumped else consistent_mass(self.mesh)
         return (self.tissue.mobility * laplacian(self.mesh))[self.inner], mass[self.inner]
 
     @cached_property

@@ -13,9 +13,9 @@ from poro.arrays import Array
 FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class TetMesh:
-    """Positively oriented linear tetrahedra. points: (n, 3) mm; tets: (m, 4) node numbers."""
+    """Positively oriented linear tetrahedra. points: (n, 3) mm; tets: (m, 4) node numbers. Equal only to itself."""
 
     points: Array
     tets: Array
