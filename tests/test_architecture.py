@@ -1,0 +1,93 @@
+"""Arrows between rooms run one way: what each may import is in the table, and the table has no circle."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+from graphlib import TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+ROOMS: dict[str, dict[str, set[str]]] = {
+    "poro": {
+        "arrays": set(),
+        "errors": set(),
+        "linalg": {"arrays", "errors"},
+        "mesh": {"arrays"},
+        "fem": {"arrays", "errors", "linalg", "mesh"},
+        "contact": {"arrays", "errors", "linalg", "mesh"},
+        "collapse": {"arrays", "errors", "contact", "fem", "linalg", "mesh"},
+        "fit": {"arrays", "collapse", "fem", "mesh"},
+    },
+}
+"""Package -> room (a folder, or a module beside them) -> rooms of the same package that it may import."""
+
+FOREIGN: dict[str, set[str]] = {
+    "poro": {"registration", "phantoms", "vatsloc"},
+}
+"""Package -> packages of ours that it must not know."""
+
+
+def imported(file: Path) -> set[str]:
+    """Dotted names of the modules that a file imports."""
+    found: set[str] = set()
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom) and node.module is not None:
+            found.add(node.module)
+        elif isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+    return found
+
+
+def room_of(package: str, file: Path) -> str:
+    return file.relative_to(ROOT / package).with_suffix("").parts[0]
+
+
+def files_of(package: str) -> list[Path]:
+    """All modules but the package's own front door, which hands on from every room."""
+    return [file for file in sorted((ROOT / package).rglob("*.py")) if file != ROOT / package / "__init__.py"]
+
+
+@pytest.mark.parametrize("package", ROOMS)
+def test_rooms_import_what_the_table_lets_them(package: str) -> None:
+    strays = []
+    for file in files_of(package):
+        room = room_of(package, file)
+        for module in imported(file):
+            top, _, rest = module.partition(".")
+            if top == package and rest.split(".")[0] not in ROOMS[package][room] | {room}:
+                strays.append(f"{file.relative_to(ROOT)} imports {module}")
+    assert strays == []
+
+
+@pytest.mark.parametrize("package", ROOMS)
+def test_the_table_has_every_room_and_no_circle(package: str) -> None:
+    assert {room_of(package, file) for file in files_of(package)} == set(ROOMS[package])
+    TopologicalSorter(ROOMS[package]).prepare()  # raises CycleError
+
+
+@pytest.mark.parametrize("package", ROOMS)
+def test_modules_import_each_other_in_no_circle(package: str) -> None:
+    names = {file: ".".join(file.relative_to(ROOT).with_suffix("").parts) for file in files_of(package)}
+    doors = {file: name.removesuffix(".__init__") for file, name in names.items()}
+    TopologicalSorter({doors[file]: imported(file) for file in names}).prepare()  # raises CycleError
+
+
+@pytest.mark.parametrize("package", FOREIGN)
+def test_packages_know_nothing_of_those_above_and_beside_them(package: str) -> None:
+    known = {module.split(".")[0] for file in (ROOT / package).rglob("*.py") for module in imported(file)}
+    assert known & FOREIGN[package] == set()
+
+
+@pytest.mark.parametrize("package", ROOMS)
+def test_every_front_door_names_what_is_behind_it(package: str) -> None:
+    for door in sorted((ROOT / package).rglob("__init__.py")):
+        name = ".".join(door.parent.relative_to(ROOT).parts)
+        module = importlib.import_module(name)
+        assert module.__doc__, name
+        assert module.__all__ == sorted(module.__all__), name
+        assert 2 <= len(module.__all__) <= 12, name
+        assert all(hasattr(module, entry) for entry in module.__all__), name
