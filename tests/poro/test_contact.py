@@ -16,6 +16,8 @@ from poro.collapse import Theta, assemble, solve
 from poro.contact import ChestWall, Compliance, ContactStatus, LevelSet, contact_sensitivity, level_set, solve_contact
 from poro.contact.active_set import LinearizedContact, linear_complementarity
 from poro.contact.geometric_stiffness import GeometricStiffness, geometric_stiffness
+from poro.contact.kkt import kkt_factor
+from poro.errors import SolverError
 from poro.fem import Solid, Tissue, solid
 from poro.fem.forms import body_load
 from poro.fem.tissue import GRAVITY_KPA_PER_MM
@@ -225,7 +227,7 @@ def test_sensitivity_of_contact_equals_finite_differences(hollow: tuple) -> None
 
 
 def test_nodes_that_the_diaphragm_lets_behind_the_cage_are_counted_and_the_hilum_is_left_out() -> None:
-    """A diaphragm that sinks under a heavy lung takes its nodes along, out of the cage."""
+    """A diaphragm that sinks under a heavy lung takes its nodes along, out of the chest wall."""
     mesh = ellipsoid(15.0)
     held = np.flatnonzero(np.linalg.norm(mesh.points - [-30, 0, 0], axis=1) < 16)
     system = assemble(mesh, Tissue(), np.array([0, 0, -1.0]), held, np.zeros((len(held), 3)))
@@ -241,3 +243,8 @@ def test_nodes_that_the_diaphragm_lets_behind_the_cage_are_counted_and_the_hilum
             assert state.conflicts > 5
         else:
             assert state.conflicts == 0
+
+
+def test_contact_nodes_that_move_alike_have_no_forces() -> None:
+    with pytest.raises(SolverError, match="contact nodes 1 and an earlier one move alike"):
+        kkt_factor(np.ones((2, 2)), np.zeros((2, 0)), np.zeros((0, 0)), np.dtype(float))

@@ -64,3 +64,18 @@ def test_a_moved_target_draws_the_lung_onto_itself() -> None:
     left = np.linalg.norm(found.u - shift, axis=1)
     assert left.mean() < 0.25
     assert left.max() < 0.8
+
+
+def test_standard_deviations_are_those_of_the_fit_but_for_the_share_of_a_keypoints() -> None:
+    mesh = ellipsoid(16.0)
+    s = mesh.boundary
+    x = np.array([[0.0, 0, 0], [10, 5, 0]])
+    target = Target(s.points, s.node_normals, np.ones(len(s.points)), x, x + 1.0, np.array([1.0, 0.25]))
+    still = np.zeros_like(mesh.points)
+    plain, other = (
+        constraints_to(target, mesh, still, FitSettings(surface_sigma_mm=surface, keypoint_sigma_mm=inner))
+        for surface, inner in ((2.0, 2.0), (3.0, 5.0))
+    )
+    assert_allclose(plain.sigma_mm[-2:], [1.5, 3.0])
+    assert_allclose(other.sigma_mm[-2:], [3.75, 7.5])
+    assert_allclose(other.sigma_mm[:-2], 1.5 * plain.sigma_mm[:-2])

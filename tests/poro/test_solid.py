@@ -5,13 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from scipy.sparse import csr_matrix
+from scipy.sparse import csr_matrix, identity
 from shapes import box, ellipsoid, order
 from skfem import BilinearForm
 from skfem.helpers import grad
 
+import poro.linalg.solver
 from poro.arrays import Array
 from poro.collapse.modes import eigenstrain_mode
+from poro.errors import SolverError
 from poro.fem import Tissue, solid
 from poro.fem.forms import (
     body_load,
@@ -190,6 +192,24 @@ def test_multigrid_agrees_with_the_factorization(poisson: float) -> None:
     assert (residuals[-1] / residuals[0]) ** (1 / (len(residuals) - 1)) < 0.5
     many = direct.solve(np.stack([right, 2 * right], 1))
     assert_allclose(many[:, 1], 2 * exact, rtol=1e-9, atol=1e-9 * np.abs(exact).max())
+
+
+def test_multigrid_that_runs_out_of_iterations_says_so_with_its_residuals(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(poro.linalg.solver, "MAX_ITERATIONS", 3)
+    matrix = laplacian(box((12, 12, 12), (30.0, 30.0, 30.0))) + 1e-3 * identity(13**3)
+    solver = linear_solver(matrix.tocsr(), np.random.default_rng(0).normal(size=(13**3, 3)), limit=0)
+    with pytest.raises(SolverError, match="after 3 iterations") as stopped:
+        solver.solve(np.random.default_rng(1).normal(size=13**3))
+    residuals = stopped.value.residuals
+    assert len(residuals) == 4
+    assert residuals[0] == 1
+    assert 1e-10 < residuals[-1] < 0.5
+
+
+def test_a_body_that_its_constraints_leave_free_has_no_answer() -> None:
+    mesh = ellipsoid(25.0)
+    with pytest.raises(SolverError, match="move freely"):
+        solid(mesh, TISSUE, np.zeros(0, int), csr_matrix((3 * len(mesh.points), 3 * len(mesh.points))))
 
 
 def test_a_body_that_nothing_holds_is_refused() -> None:

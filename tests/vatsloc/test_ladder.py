@@ -13,7 +13,8 @@ from poro.fem import Tissue, neo_hookean
 from poro.fit import Fit, FitSettings, Target, fit_collapse
 from poro.mesh import TetMesh, stuff
 from registration.matching import Pairs
-from vatsloc.workflow.ladder import NO_OTHERS, Model, Step, best_of, corrected, held_back, misfit
+from vatsloc.workflow.ladder import NO_OTHERS, Model, Step, best_of, corrected, fit_settings, held_back, misfit
+from vatsloc.workflow.settings import settings_of
 from vatsloc.workflow.spread import other_answers
 
 GRADIENT = np.array([[-0.1, 0.02, 0.0], [0.03, -0.05, 0.04], [0.0, -0.02, 0.08]])
@@ -105,6 +106,19 @@ def test_a_step_that_fails_with_all_pairs_gives_way_to_the_next_best(still: Mode
     model, _ = best_of({"fails": fails, "holds": corrected(0.0125, FitSettings())}, still, still, surface)
     assert {rung.name: rung.kept for rung in model.rungs} == {"fails": False, "holds": True}
     assert np.abs(model.displacement).max() > 1.0
+
+
+def test_the_standard_deviation_of_keypoints_in_the_settings_reaches_the_correction(
+    still: Model, surface: Target
+) -> None:
+    """The surer they are said to be, the closer they are followed."""
+    target = replace(surface, inflated=still.pairs.first, deflated=still.pairs.second, keypoint_weights=np.ones(300))
+    left = []
+    for sigma_mm in (0.5, 50.0):
+        settings = fit_settings(settings_of("balanced", {"keypoints": {"sigma_mm": sigma_mm}}))
+        found = corrected(0.05, settings)(still, target, still.fit)
+        left.append(misfit(still.system.mesh, found.displacement, still.pairs))
+    assert left[0] < 0.5 * left[1]
 
 
 def test_noise_alone_is_not_worth_a_rung(still: Model) -> None:
