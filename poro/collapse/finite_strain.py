@@ -138,12 +138,12 @@ def _newton(
         _, stress, moduli = _respond(problem, deformation_gradient(problem.mesh, u), share)
         unbalanced = load - eigenstress_load(problem.mesh, stress)
         gap, gradient, hessian = _gap(problem, u, share)
-        bend = -force[:, None, None] * hessian
+        geometric = -force[:, None, None] * hessian
         # Far from balance the tangent may be indefinite; its convex part still descends.
         for convex in (True,) if last > _NEAR else (False, True):
-            parts = (
-                (_convex(moduli.reshape(-1, 9, 9)).reshape(moduli.shape), _convex(bend)) if convex else (moduli, bend)
-            )
+            parts = moduli, geometric
+            if convex:
+                parts = _convex(moduli.reshape(-1, 9, 9)).reshape(moduli.shape), _convex(geometric)
             matrix = tangent_stiffness(problem.mesh, parts[0])
             if len(nodes):
                 matrix = (matrix + _blocks(len(u), nodes, parts[1])).tocsr()
@@ -193,10 +193,10 @@ def _linearized_contact(
         except SolverError:
             return None
         ahead = gap + np.einsum("nd,nd->n", gradient, change[nodes])
-        turned = (active & (force < 0)) | (~active & (ahead < -1e-9))
-        if not turned.any():
+        flipped = (active & (force < 0)) | (~active & (ahead < -1e-9))
+        if not flipped.any():
             break
-        active = active ^ turned
+        active = active ^ flipped
     return change, np.maximum(force, 0), active
 
 
@@ -218,7 +218,7 @@ def _constrained_step(
 ) -> tuple[Array, Array]:
     """Newton step (n, 3) that closes the gap at active nodes and moves the held ones by `jump`; contact forces (nc,).
 
-    Active nodes are turned so that their first axis is the wall's normal, and that unknown is then imposed. Raises
+    Active nodes are rotated so that their first axis is the wall's normal, and that unknown is then imposed. Raises
     SolverError when the tangent is not positive definite.
     """
     gap, gradient, active = contact
@@ -228,8 +228,8 @@ def _constrained_step(
     steep = np.linalg.norm(gradient[active], axis=1)
     frames = np.broadcast_to(np.eye(3), (count, 3, 3)).copy()
     frames[pressed] = _frames(gradient[active] / steep[:, None])
-    turn = bsr_matrix((frames, np.arange(count), np.arange(count + 1))).tocsr()
-    turned = (turn @ matrix @ turn.T).tocsr()
+    rotation = bsr_matrix((frames, np.arange(count), np.arange(count + 1))).tocsr()
+    rotated = (rotation @ matrix @ rotation.T).tocsr()
     imposed = np.zeros((count, 3))
     imposed[pressed, 0] = -gap[active] / steep
     imposed[problem.fixed] = jump
@@ -237,14 +237,14 @@ def _constrained_step(
     known[pressed, 0] = True
     known[problem.fixed] = True
     free = diags((~known.ravel()).astype(float))
-    right = (turn @ unbalanced.ravel() - turned @ imposed.ravel()) * ~known.ravel()
-    scale = float(turned.diagonal().mean())
-    reduced = (free @ turned @ free + diags(scale * known.ravel())).tocsr()
+    right = (rotation @ unbalanced.ravel() - rotated @ imposed.ravel()) * ~known.ravel()
+    scale = float(rotated.diagonal().mean())
+    reduced = (free @ rotated @ free + diags(scale * known.ravel())).tocsr()
     change = linear_solver(reduced, problem.mesh.points).solve(right + scale * imposed.ravel() * known.ravel())
-    reaction = (turned @ change - turn @ unbalanced.ravel()).reshape(-1, 3)
+    reaction = (rotated @ change - rotation @ unbalanced.ravel()).reshape(-1, 3)
     force = np.zeros(len(nodes))
     force[active] = reaction[pressed, 0] / steep
-    return (turn.T @ change).reshape(-1, 3), force
+    return (rotation.T @ change).reshape(-1, 3), force
 
 
 def _frames(normals: Array) -> Array:

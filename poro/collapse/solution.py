@@ -18,7 +18,7 @@ class PoroStatus(Enum):
     """How a forward solution ended."""
 
     SOLVED = "solved"
-    INVERTED = "solved, but some elements are turned inside out: linear strain is out of its range"
+    INVERTED = "solved, but some elements are inverted: linear strain is out of its range"
     NOT_CONVERGED = "contact did not converge"
 
 
