@@ -44,11 +44,11 @@ def pressure_bounds() -> list[Row]:
 
 def inverted_elements() -> list[Row]:
     """Smallest det F and inverted share over (kappa_b, phi) and the diaphragm's rise, linear against neo-Hookean."""
-    system, rows, law = system_of(lung(TETS), _TISSUE, smooth_wall()), [], neo_hookean(_TISSUE)
+    system, rows, material = system_of(lung(TETS), _TISSUE, smooth_wall()), [], neo_hookean(_TISSUE)
     phis = (0.3, 0.6, 0.9)
     values = [*product((1e-9, 1e-8, 1e-6), phis, (0.0,)), *product((1e-9,), phis, (40.0,))]
     for theta in (Theta(*value) for value in values):
-        linear, finite = solve(system, theta), deform(finite_problem(system, theta, law))
+        linear, finite = solve(system, theta), deform(finite_problem(system, theta, material))
         det = np.linalg.det(deformation_gradient(system.mesh, finite.u))
         total = system.mesh.volumes.sum()
         rows.append(
