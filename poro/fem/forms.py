@@ -1,8 +1,11 @@
 """The weak forms of the method on linear tetrahedra, as scikit-fem reads them, and the matrices and loads they become.
 
-Find u and p so that for all v and q  elasticity(u, v) = pressure_force(p, v) + body_force(v) + initial_stress(v)  and
-mobility diffusion(p, q) + kappa_b reaction(p, q) = kappa_b reaction(p_bronchi, q).  Unknowns of displacement are
-numbered 3 * node + axis. Ref: Alvarez 2021, eqs. 2, 10, 11.
+Find u and p so that for all v and q
+
+    elasticity(u, v) = biot pressure_force(p, v) + body_force(v) + initial_stress(v)
+    mobility diffusion(p, q) + kappa_b reaction(p, q) = kappa_b reaction(p_bronchial, q)
+
+Unknowns of displacement are numbered 3 * node + axis. Ref: Alvarez 2021, eqs. 2, 10, 11.
 """
 
 from __future__ import annotations
@@ -67,13 +70,13 @@ def _skfem(mesh: TetMesh) -> MeshTet:
 
 
 def stiffness(mesh: TetMesh, lame_kpa: float, shear_kpa: float) -> csr_matrix:
-    """Matrix (3n, 3n) kPa mm of `elasticity`. The last two are kept, since an elastic correction or a continuation
+    """Matrix (3n, 3n) kPa mm of `elasticity`. The last one is kept, since an elastic correction or a continuation
     solves with the same one again and again; add to it, never change it.
     """
     return _stiffness(mesh, float(lame_kpa), float(shear_kpa))
 
 
-@lru_cache(maxsize=2)
+@lru_cache(maxsize=1)
 def _stiffness(mesh: TetMesh, lame_kpa: float, shear_kpa: float) -> csr_matrix:
     return elasticity.assemble(vector_basis(mesh), lame=lame_kpa, shear=shear_kpa)
 
