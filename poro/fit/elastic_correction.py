@@ -16,7 +16,7 @@ from poro.fem.constraints import interpolation_matrix, point_constraints
 from poro.fem.forms import deformation_gradient
 from poro.fem.solid import solid
 from poro.fem.tissue import Tissue
-from poro.fit.observations import Target, independence
+from poro.fit.observations import Target, facing, independence
 from poro.fit.problem import FitSettings
 from poro.mesh.closest import closest_points
 from poro.mesh.locate import Location, locate
@@ -63,8 +63,8 @@ def constraints_to(target: Target, mesh: TetMesh, u: Array, settings: FitSetting
     boundary = mesh.boundary
     moved = boundary.moved(boundary.points + u[boundary.nodes])
     near = closest_points(moved, target.points)
-    agree = np.einsum("td,td->t", moved.normals[near.triangle], target.normals)
-    used = np.flatnonzero((agree > 0.5) & (np.abs(near.distance) < REACH_MM) & (target.weights > 0))
+    agree = facing(moved, near, target.normals) > 0.5
+    used = np.flatnonzero(agree & (np.abs(near.distance) < REACH_MM) & (target.weights > 0))
     corners = boundary.points[boundary.triangles[near.triangle[used]]]
     rest = np.einsum("qk,qkd->qd", near.barycentric[used], corners)
     share = target.weights[used] * independence(target.points[used], settings.correlation_mm)

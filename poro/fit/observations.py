@@ -9,9 +9,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from poro.arrays import Array
-from poro.mesh.closest import closest_points
+from poro.mesh.closest import ClosestPoints, closest_points
 from poro.mesh.locate import Location, interpolate, locate
-from poro.mesh.tetmesh import TetMesh
+from poro.mesh.tetmesh import TetMesh, TriSurface
 
 
 @dataclass(frozen=True)
@@ -102,8 +102,7 @@ class Observer:
         """Signed distance of every target point to the deformed surface, exact and so with an exact derivative.
 
         Where the target's normal and the surface's disagree the point is taken to belong to another side and loses
-        weight. The surface's is taken from its nodes: most nearest points lie on an edge, where the faces' own normals
-        would leave the weight to rounding.
+        weight.
         """
         boundary = self.mesh.boundary
         moved = boundary.moved(boundary.points + u[boundary.nodes])
@@ -114,9 +113,7 @@ class Observer:
         far = length > 1e-6
         normal = np.where(far, np.sign(near.distance)[:, None] * offset / np.where(far, length, 1), face)
         share = -near.barycentric[:, :, None] * normal[:, None]
-        smooth = np.einsum("tc,tcd->td", near.barycentric, moved.node_normals[moved.triangles[near.triangle]])
-        smooth /= np.maximum(np.linalg.norm(smooth, axis=1), 1e-12)[:, None]
-        agree = np.clip(np.einsum("td,td->t", smooth, self.target.normals), 0, 1)
+        agree = np.clip(facing(moved, near, self.target.normals), 0, 1)
         nodes = boundary.nodes[boundary.triangles[near.triangle]]
         every = np.arange(len(length))
         return Residuals(near.distance, nodes, share, every, self.target.weights * agree, np.ones(len(every), bool))
@@ -136,6 +133,17 @@ class Observer:
             np.repeat(self.target.weights, 3),
             np.ones(3 * count, bool),
         )
+
+
+def facing(surface: TriSurface, near: ClosestPoints, normals: Array) -> Array:
+    """Cosine (t,) between normals (t, 3) and the surface's at the points of it that lie nearest.
+
+    The surface's are taken from its nodes: most nearest points lie on an edge, where the faces' own normals would leave
+    the answer to rounding.
+    """
+    smooth = np.einsum("tc,tcd->td", near.barycentric, surface.node_normals[surface.triangles[near.triangle]])
+    smooth /= np.maximum(np.linalg.norm(smooth, axis=1), 1e-12)[:, None]
+    return np.asarray(np.einsum("td,td->t", smooth, normals))
 
 
 def _widen(rows: Residuals, corners: int) -> Residuals:

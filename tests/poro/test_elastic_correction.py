@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.testing import assert_allclose
-from shapes import ellipsoid
+from shapes import box, ellipsoid
 
 from poro.fem import Tissue
 from poro.fit import FitSettings, Target, constraints_to, elastic_correction
@@ -79,3 +79,18 @@ def test_standard_deviations_are_those_of_the_fit_but_for_the_share_of_a_keypoin
     assert_allclose(plain.sigma_mm[-2:], [1.5, 3.0])
     assert_allclose(other.sigma_mm[-2:], [3.75, 7.5])
     assert_allclose(other.sigma_mm[:-2], 1.5 * plain.sigma_mm[:-2])
+
+
+def test_which_surface_points_count_is_not_left_to_rounding() -> None:
+    """Points over the edges of a box, whose faces they face at 45 degrees or less: either face lies nearest."""
+    mesh = box((4, 4, 4), (40.0, 40.0, 40.0))
+    rng = np.random.default_rng(0)
+    along = rng.uniform(5, 35, 60)
+    points = np.stack([np.full(60, 43.0), np.full(60, 43.0), along], axis=1)
+    normals = np.array([np.cos(a) * np.eye(3)[0] + np.sin(a) * np.eye(3)[1] for a in rng.uniform(-0.1, 0.1, 60)])
+    target = Target(points, normals, np.ones(60))
+    chosen = set()
+    for _ in range(5):
+        u = 1e-9 * rng.normal(size=mesh.points.shape)
+        chosen.add(len(constraints_to(target, mesh, u, FitSettings()).points))
+    assert chosen == {60}
