@@ -1,16 +1,16 @@
-"""Tetrahedral lung meshes: stuffing of a mask, surface and patches, quality, point location."""
+"""Tetrahedral meshes of a lung: how a mask is filled, its surface and patches, quality, and where points lie.
 
-from poro.mesh.closest import ClosestPoints, closest_points
-from poro.mesh.locate import Location, interpolate, locate
-from poro.mesh.patches import Patches, patches, principal_axis
+`stuff` fills a mask with tetrahedra (`TetMesh`), `locate` and `interpolate` carry nodal fields to points, and
+`closest_points` measures distances from a surface (`TriSurface`).
+"""
+
+from poro.mesh.closest import closest_points
+from poro.mesh.locate import interpolate, locate
+from poro.mesh.patches import patches, principal_axis
 from poro.mesh.stuffing import signed_distance, stuff, stuff_level_set
-from poro.mesh.tetmesh import Quality, TetMesh, TriSurface, quality, surface
+from poro.mesh.tetmesh import TetMesh, TriSurface, quality, surface
 
 __all__ = [
-    "ClosestPoints",
-    "Location",
-    "Patches",
-    "Quality",
     "TetMesh",
     "TriSurface",
     "closest_points",

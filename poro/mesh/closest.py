@@ -8,7 +8,8 @@ import numpy as np
 from numba import njit, prange
 from scipy.spatial import cKDTree
 
-from poro.mesh.tetmesh import Array, TriSurface
+from poro.arrays import Array
+from poro.mesh.tetmesh import TriSurface
 
 CLUSTER = 8  # triangles per bounding sphere
 

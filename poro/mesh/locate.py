@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit, prange
 
+from poro.arrays import Array
 from poro.mesh.closest import closest_points
-from poro.mesh.tetmesh import Array, TetMesh
+from poro.mesh.tetmesh import TetMesh
 
 
 @dataclass(frozen=True)
@@ -40,8 +42,8 @@ def locate(mesh: TetMesh, points: Array, nearest: bool = True) -> Location:
     shape = np.floor((mesh.points.max(axis=0) - origin) / width).astype(np.int64) + 1
     first = np.clip(((lower - origin) / width).astype(np.int64), 0, shape - 1)
     last = np.clip(((upper - origin) / width).astype(np.int64), 0, shape - 1)
-    start, members = _bins(first, last, shape)
-    tet, bary = _search(points, x[:, 0].copy(), mesh.gradients, origin, width, shape, start, members)
+    cells = _Cells(origin, width, shape, *_bins(first, last, shape))
+    tet, bary = _search(points, x[:, 0].copy(), mesh.gradients, cells)
     nodes = mesh.tets[np.maximum(tet, 0)]
     distance = np.zeros(len(points))
     lost = np.flatnonzero(tet < 0)
@@ -61,6 +63,16 @@ def locate(mesh: TetMesh, points: Array, nearest: bool = True) -> Location:
 def interpolate(location: Location, nodal: Array) -> Array:
     """Values (q, ...) of a nodal field (n, ...) at located points."""
     return np.einsum("qk,qk...->q...", location.barycentric, nodal[location.nodes])
+
+
+class _Cells(NamedTuple):
+    """Uniform grid of cubes of `width` mm from `origin` (3,), and the tetrahedra in each, as compressed rows."""
+
+    origin: Array
+    width: float
+    shape: Array
+    start: Array
+    members: Array
 
 
 @njit(cache=True)
@@ -86,16 +98,8 @@ def _bins(first: Array, last: Array, shape: Array) -> tuple[Array, Array]:
 
 
 @njit(cache=True, parallel=True)
-def _search(
-    points: Array,
-    corner: Array,
-    gradients: Array,
-    origin: Array,
-    width: float,
-    shape: Array,
-    start: Array,
-    members: Array,
-) -> tuple[Array, Array]:
+def _search(points: Array, corner: Array, gradients: Array, cells: _Cells) -> tuple[Array, Array]:
+    origin, width, shape, start, members = cells
     found = np.full(len(points), -1)
     bary = np.zeros((len(points), 4))
     for q in prange(len(points)):

@@ -9,7 +9,8 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from poro.mesh.tetmesh import Array, TetMesh, TriSurface
+from poro.arrays import Array
+from poro.mesh.tetmesh import TetMesh, TriSurface
 
 # Cosines of the tilt up to which a face still counts as looking down, or inward.
 DOWN, INWARD = 0.5, 0.35

@@ -12,7 +12,8 @@ from scipy import ndimage
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from poro.mesh.tetmesh import FACES, Array, TetMesh, dihedral_angles, signed_volumes
+from poro.arrays import Array
+from poro.mesh.tetmesh import FACES, TetMesh, dihedral_angles, signed_volumes
 
 # Largest cut-to-vertex distance, as a share of the edge, at which a lattice vertex is pulled onto the surface.
 WARP_LONG, WARP_SHORT = 0.24999, 0.41189

@@ -4,20 +4,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[Any]
+from poro.arrays import Array
 
 # Faces of a positively oriented tetrahedron, seen anticlockwise from outside.
 FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class TetMesh:
-    """Positively oriented linear tetrahedra. points: (n, 3) mm; tets: (m, 4) node numbers."""
+    """Positively oriented linear tetrahedra. points: (n, 3) mm; tets: (m, 4) node numbers. Equal only to itself."""
 
     points: Array
     tets: Array

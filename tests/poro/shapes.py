@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from poro.compliance import Compliance
+from poro.arrays import Array
+from poro.contact import Compliance
+from poro.fem import Solid
+from poro.fem.solid import unknowns_of
 from poro.mesh import TetMesh, stuff_level_set
-from poro.mesh.tetmesh import Array, signed_volumes
-from poro.solid import Solid, unknowns_of
+from poro.mesh.tetmesh import signed_volumes
 
 
 def box(cells: tuple[int, int, int], size: tuple[float, float, float]) -> TetMesh:

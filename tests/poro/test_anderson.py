@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.testing import assert_allclose
 
-from poro.anderson import DEPTH, Anderson
+from poro.linalg import Anderson
+from poro.linalg.anderson import DEPTH
 
 
 def test_a_linear_map_of_few_rates_ends_in_as_many_steps() -> None:
@@ -24,11 +25,11 @@ def test_a_linear_map_of_few_rates_ends_in_as_many_steps() -> None:
     assert steps <= 5
 
 
-def test_forgetting_gives_the_plain_step_back() -> None:
+def test_a_restart_gives_the_plain_step_back() -> None:
     anderson = Anderson()
     for k in range(DEPTH + 3):
         anderson.mix(np.array([1.0 / (k + 1), 0.2 * k]), np.array([float(k), 1.0]))
-    anderson.forget()
+    anderson.restart()
     following = np.array([3.0, 4.0])
     (mixed,) = anderson.mix(np.array([0.1, 0.2]), following)
     assert_allclose(mixed, following)

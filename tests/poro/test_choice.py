@@ -1,4 +1,4 @@
-"""Which model runs, why, and that the finite-strain lung is in balance with its suction, weight and wall."""
+"""Which strain measure is used, why, and that the finite-strain lung balances its pressure, weight and wall."""
 
 from __future__ import annotations
 
@@ -7,17 +7,14 @@ import pytest
 from numpy.testing import assert_allclose
 from shapes import ellipsoid
 
-from poro.assembly import deformation_gradient
-from poro.choice import Model, Range, finite_problem, keep_in_range, solve_in_range
-from poro.finite import FiniteProblem, FiniteStatus, deform
-from poro.laws import neo_hookean
-from poro.model import PoroSystem, Theta, assemble, solve
-from poro.modes import hilum_modes
-from poro.solid import solid
-from poro.tissue import Tissue
+from poro.collapse import LinearRange, PoroSystem, StrainMeasure, Theta, assemble, hilum_modes, keep_in_range, solve
+from poro.collapse.choice import finite_problem, solve_in_range
+from poro.collapse.finite_strain import FiniteProblem, FiniteStatus, deform
+from poro.fem import Tissue, neo_hookean, solid
+from poro.fem.forms import deformation_gradient
 
 TISSUE = Tissue()
-LAW = neo_hookean(TISSUE)
+MATERIAL = neo_hookean(TISSUE)
 
 
 @pytest.fixture(scope="module")
@@ -27,28 +24,28 @@ def system() -> PoroSystem:
     return assemble(mesh, TISSUE, np.array([-1.0, 0, 0]), held, np.broadcast_to([1.0, 0, 2.0], (len(held), 3)))
 
 
-def test_suction_at_small_load_is_the_pressure_gradients_linear_force(system: PoroSystem) -> None:
+def test_pressure_at_small_load_is_the_pressure_gradients_linear_force(system: PoroSystem) -> None:
     """Integral of q div v equals that of -alpha grad p . v, for p with its surface value on the whole surface."""
     p, _ = system.flow.pressure(1e-8)
-    suction = TISSUE.pleural_kpa - p[system.mesh.tets].mean(axis=1)
+    drop = TISSUE.pleural_kpa - p[system.mesh.tets].mean(axis=1)
     still = np.zeros_like(system.hilum_displacement)
     small = 1e-4
     problem = FiniteProblem(
-        system.mesh, LAW, system.hilum, still, np.zeros_like(system.mesh.points), None, small * suction
+        system.mesh, MATERIAL, system.hilum, still, np.zeros_like(system.mesh.points), None, small * drop
     )
     linear = solid(system.mesh, TISSUE, system.hilum).solve((system.pressure_load @ p).reshape(-1, 3))
     state = deform(problem)
     assert_allclose(state.u / small, linear, atol=1e-3 * np.abs(linear).max())
 
 
-def test_free_body_under_uniform_suction_shrinks_by_the_closed_form() -> None:
+def test_free_body_under_uniform_pressure_drop_shrinks_by_the_closed_form() -> None:
     """F = s I: mu (s - 1 / s) + 3 lambda ln s / s + q s^2 = 0."""
     lame, mu, s = TISSUE.lame_kpa, TISSUE.shear_kpa, 0.8
     q = -(mu * (s - 1 / s) + 3 * lame * np.log(s) / s) / s**2
     mesh = ellipsoid(18.0)
     held = np.flatnonzero(mesh.points[:, 2] < -40)
     exact = (s - 1) * mesh.points
-    problem = FiniteProblem(mesh, LAW, held, exact[held], 0 * exact, None, np.full(len(mesh.tets), q))
+    problem = FiniteProblem(mesh, MATERIAL, held, exact[held], 0 * exact, None, np.full(len(mesh.tets), q))
     state = deform(problem)
     assert q > 0
     assert state.status is FiniteStatus.SOLVED
@@ -56,8 +53,8 @@ def test_free_body_under_uniform_suction_shrinks_by_the_closed_form() -> None:
 
 
 def test_gentle_lungs_stay_linear_and_say_so(system: PoroSystem) -> None:
-    chosen = solve_in_range(system, Theta(1e-10, 0.9), LAW)
-    assert chosen.model is Model.LINEAR
+    chosen = solve_in_range(system, Theta(1e-10, 0.9), MATERIAL)
+    assert chosen.strain is StrainMeasure.LINEAR
     assert chosen.finite is None
     assert chosen.why.startswith("linear strain: 0.00 %")
     assert_allclose(chosen.state.u, solve(system, Theta(1e-10, 0.9)).u, atol=1e-2)
@@ -65,9 +62,9 @@ def test_gentle_lungs_stay_linear_and_say_so(system: PoroSystem) -> None:
 
 def test_collapsed_lungs_go_finite_and_hold_signorini(system: PoroSystem) -> None:
     theta = Theta(1e-6, 0.5, 4.0)
-    chosen = solve_in_range(system, theta, LAW, Range(min_det=0.5))
+    chosen = solve_in_range(system, theta, MATERIAL, LinearRange(min_det=0.5))
     state = chosen.state
-    assert chosen.model is Model.FINITE
+    assert chosen.strain is StrainMeasure.FINITE
     assert chosen.why.startswith("neo-Hookean:")
     assert state.det_f.min() > 0.05
     assert_allclose(state.det_f, np.linalg.det(deformation_gradient(system.mesh, state.u)))
@@ -83,26 +80,26 @@ def test_finite_strain_is_left_out_where_it_moves_nothing_and_kept_where_it_does
     """What the choice is worth: median motion of the nodes between both strain measures, under one load."""
 
     def apart(theta: Theta) -> float:
-        linear, finite = (solve_in_range(system, theta, LAW, Range(share=share)) for share in (1.0, -1.0))
-        assert (linear.model, finite.model) == (Model.LINEAR, Model.FINITE)
+        linear, finite = (solve_in_range(system, theta, MATERIAL, LinearRange(share=share)) for share in (1.0, -1.0))
+        assert (linear.strain, finite.strain) == (StrainMeasure.LINEAR, StrainMeasure.FINITE)
         return float(np.median(np.linalg.norm(linear.state.u - finite.state.u, axis=1)))
 
     gentle, strong = Theta(1e-10, 0.9), Theta(1e-6, 0.5, 4.0)
-    assert solve_in_range(system, gentle, LAW).model is Model.LINEAR
+    assert solve_in_range(system, gentle, MATERIAL).strain is StrainMeasure.LINEAR
     assert apart(gentle) < 0.5
-    assert solve_in_range(system, strong, LAW).model is Model.FINITE
+    assert solve_in_range(system, strong, MATERIAL).strain is StrainMeasure.FINITE
     assert apart(strong) > 0.5
 
 
 def test_a_solved_lung_is_kept_as_it_is_or_solved_again(system: PoroSystem) -> None:
     linear = solve(system, Theta(1e-8, 0.8, 2.0))
-    kept = keep_in_range(system, linear, LAW, Range(min_det=linear.det_f.min()))
+    kept = keep_in_range(system, linear, MATERIAL, LinearRange(min_det=linear.det_f.min()))
     assert kept.state is linear
-    assert kept.entry() == {"model": "linear strain", "why": kept.why, "share_out_of_range": 0.0}
+    assert kept.entry() == {"strain": "linear strain", "why": kept.why, "share_out_of_range": 0.0}
     bound = float(np.quantile(linear.det_f, 0.25))
-    again = keep_in_range(system, linear, LAW, Range(min_det=bound))
+    again = keep_in_range(system, linear, MATERIAL, LinearRange(min_det=bound))
     assert again.state.theta is linear.theta
-    assert again.entry()["model"] == "finite strain"
+    assert again.entry()["strain"] == "finite strain"
     assert again.entry()["share_out_of_range"] == pytest.approx(0.25, abs=1 / len(linear.det_f))
     assert 0.1 < np.linalg.norm(again.state.u - linear.u, axis=1).max() < 10
 
@@ -117,4 +114,4 @@ def test_load_modes_are_refused(system: PoroSystem) -> None:
         hilum_modes(system.mesh, system.hilum)[:1],
     )
     with pytest.raises(ValueError, match="no load modes"):
-        finite_problem(with_modes, Theta(1e-9, 0.8, 0.0, (0.0,)), LAW)
+        finite_problem(with_modes, Theta(1e-9, 0.8, 0.0, (0.0,)), MATERIAL)

@@ -8,14 +8,13 @@ from numpy.testing import assert_allclose
 from scipy.sparse import identity
 from shapes import compliance_of, ellipsoid
 
-import poro.compliance
-from poro.assembly import body_load, stiffness
-from poro.compliance import Compliance
-from poro.contact import ContactStatus, Obstacle, settle
-from poro.levelset import level_set
-from poro.solid import solid, unknowns_of
-from poro.solver import inverse_at, linear_solver
-from poro.tissue import GRAVITY_KPA_PER_MM, Tissue
+import poro.contact.compliance
+from poro.contact import ChestWall, Compliance, ContactStatus, level_set, solve_contact
+from poro.fem import Tissue, solid
+from poro.fem.forms import body_load, stiffness
+from poro.fem.solid import unknowns_of
+from poro.fem.tissue import GRAVITY_KPA_PER_MM
+from poro.linalg import inverse_at, linear_solver
 
 
 @pytest.mark.parametrize(("limit", "tolerance"), [(10**9, 1e-11), (0, 1e-8)])
@@ -41,26 +40,26 @@ def test_contact_in_single_precision_moves_nodes_by_less_than_a_micron(monkeypat
     nodes = np.setdiff1d(mesh.boundary.nodes, held)
     level, rest = level_set(mesh.boundary, 6.0, 10.0), mesh.points[nodes]
     still = np.zeros(len(nodes), bool)
-    obstacle = Obstacle(level, rest, still, np.array([0, 0, 1.0]), np.minimum(level.evaluate(rest)[0], 0))
+    wall = ChestWall(level, rest, still, np.array([0, 0, 1.0]), np.minimum(level.evaluate(rest)[0], 0))
     free = body.solve(body_load(mesh, np.array([0.6, 0, -0.8]) * 200 * GRAVITY_KPA_PER_MM))[nodes]
     states = []
     for double in (10**6, 0):
-        monkeypatch.setattr(poro.compliance, "DOUBLE_UNKNOWNS", double)
+        monkeypatch.setattr(poro.contact.compliance, "DOUBLE_UNKNOWNS", double)
         compliance = compliance_of(body, nodes)
-        states.append(settle(compliance, obstacle, free, 0.0, tolerance_mm=1e-6))
+        states.append(solve_contact(compliance, wall, free, 0.0, tolerance_mm=1e-6))
         assert compliance.matrix.dtype == (np.float64 if double else np.float32)
     exact, single = states
     assert exact.active.sum() > 20
     assert (exact.active == single.active).all()
     assert 0 < np.abs(exact.u - single.u).max() < 1e-3
     for state in states:
-        assert state.status is ContactStatus.SETTLED
+        assert state.status is ContactStatus.CONVERGED
         assert_allclose(state.gap[state.active], 0, atol=1e-9)
 
 
 def test_means_over_groups_lose_nothing_to_single_precision(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Rounding in them would pull at the springs of a solution at rest."""
-    monkeypatch.setattr(poro.compliance, "GROUPS", 4)
+    """Rounding in them would load the geometric stiffness of a solution at rest."""
+    monkeypatch.setattr(poro.contact.compliance, "GROUPS", 4)
     rng = np.random.default_rng(0)
     matrix = rng.uniform(0.5, 1.5, (600, 600)).astype(np.float32)
     matrix = np.tril(matrix) + np.tril(matrix, -1).T

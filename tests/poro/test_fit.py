@@ -10,25 +10,16 @@ import pytest
 from numpy.testing import assert_allclose
 from shapes import ellipsoid
 
-from poro.fit import (
-    REACH,
-    Fit,
-    FitSettings,
-    FitStatus,
-    _normal_equations,
-    _Problem,
-    _worth,
-    ellipsoid95,
-    fit,
-    point_covariance,
-)
-from poro.identify import THETA_NAMES, identifiability
-from poro.mesh import interpolate, locate
-from poro.mesh.tetmesh import Array
-from poro.model import PoroState, PoroStatus, PoroSystem, Theta, assemble, sensitivity, solve
-from poro.modes import hilum_modes, shape_modes, shrinkage_modes
-from poro.observations import Observer, Target
-from poro.tissue import Tissue
+from poro.arrays import Array
+from poro.collapse import PoroState, PoroStatus, PoroSystem, Theta, assemble, hilum_modes, solve, uniform_strain_modes
+from poro.collapse.modes import LoadMode, eigenstrain_mode
+from poro.collapse.solution import sensitivity
+from poro.fem import Tissue
+from poro.fit import Fit, FitSettings, FitStatus, Target, ellipsoid95, fit_collapse, identifiability, point_covariance
+from poro.fit.identifiability import THETA_NAMES
+from poro.fit.observations import Observer
+from poro.fit.problem import STEP_SCALE, FitProblem
+from poro.mesh import TetMesh, interpolate, locate
 
 TISSUE = Tissue()
 GRAVITY = np.array([-1.0, 0.0, 0.0])
@@ -111,7 +102,7 @@ def recovered(system: PoroSystem, truth: PoroState) -> Fit:
     settings = FitSettings(
         surface_sigma_mm=0.5, keypoint_sigma_mm=0.5, correlation_mm=5.0, tolerance=1e-5, max_steps=40
     )
-    return fit(system, _target(system, truth, inner=15), settings)
+    return fit_collapse(system, _target(system, truth, inner=15), settings)
 
 
 def test_own_target_is_recovered(recovered: Fit, truth: PoroState) -> None:
@@ -129,14 +120,14 @@ def test_no_trial_reaches_farther_than_contact_can_follow(system: PoroSystem, tr
     """The travel is all but unseen by the inner points, so an unbounded step would leap to the box's wall."""
     target = _target(system, truth, inner=15)
     unseen = Target(target.points[:0], target.normals[:0], target.weights[:0], *_inner(target))
-    history = fit(system, unseen, FitSettings(starts=((1e-9, 0.7, 0.0),))).history
+    history = fit_collapse(system, unseen, FitSettings(starts=((1e-9, 0.7, 0.0),))).history
     last = history[0].theta
     for step in history[1:]:
-        assert (np.abs(step.theta - last) <= step.radius * REACH + 1e-12).all()
+        assert (np.abs(step.theta - last) <= step.radius * STEP_SCALE + 1e-12).all()
         last = step.theta if step.accepted else last
     for step, following in pairwise(history):
         assert step.accepted or following.radius <= 0.3 * step.radius
-    assert max(abs(step.theta[0] - history[0].theta[0]) for step in history) > REACH[0]
+    assert max(abs(step.theta[0] - history[0].theta[0]) for step in history) > STEP_SCALE[0]
 
 
 def _inner(target: Target) -> tuple[Array, Array, Array]:
@@ -159,27 +150,36 @@ def test_ellipsoid_grows_with_what_is_unknown(recovered: Fit, system: PoroSystem
 
 def test_paper_cost_finds_the_same_lung_where_points_are_nodes(system: PoroSystem, truth: PoroState) -> None:
     settings = FitSettings(plain=True, robust=np.inf, starts=((1e-8, 0.85, 4.0),), tolerance=1e-5)
-    found = fit(system, _target(system, truth), settings)
+    found = fit_collapse(system, _target(system, truth), settings)
     assert np.linalg.norm(found.state.u - truth.u, axis=1).mean() < 0.6
+
+
+def _stretches(mesh: TetMesh) -> list[LoadMode]:
+    """Isotropic strains: uniform, and growing linearly along each axis from -1 to 1."""
+    centre = mesh.points[mesh.tets].mean(axis=1)
+    low, high = centre.min(axis=0), centre.max(axis=0)
+    along = 2 * (centre - low) / (high - low) - 1
+    fields = {"uniform": np.ones(len(centre)), "S": along[:, 2], "A": along[:, 1], "R": along[:, 0]}
+    return [eigenstrain_mode(mesh, TISSUE, name, x[:, None, None] * np.eye(3), 0.1) for name, x in fields.items()]
 
 
 def test_load_modes_are_recovered_from_inner_points(system: PoroSystem) -> None:
     mesh = system.mesh
-    modes = (*shrinkage_modes(mesh, TISSUE, GRAVITY, 1, 0.1), *hilum_modes(mesh, system.hilum)[:1])
+    modes = (*_stretches(mesh), *hilum_modes(mesh, system.hilum)[:1])
     wide = assemble(mesh, TISSUE, GRAVITY, system.hilum, system.hilum_displacement, modes)
     amplitudes = (-0.05, 0.04, -0.03, 0.02, 2.0)
     state = solve(wide, Theta(1e-8, 0.85, 0.0, amplitudes))
     settings = FitSettings(
         surface_sigma_mm=0.3, keypoint_sigma_mm=0.3, correlation_mm=5.0, tolerance=1e-5, max_steps=40
     )
-    found = fit(wide, _target(wide, state, inner=60), settings)
+    found = fit_collapse(wide, _target(wide, state, inner=60), settings)
     assert np.linalg.norm(found.state.u - state.u, axis=1).mean() < 0.15
     assert_allclose(found.theta.modes[:4], amplitudes[:4], atol=0.03)
     assert found.theta.modes[4] == pytest.approx(2.0, abs=0.5)
 
 
 def test_mode_sensitivity_equals_finite_differences(system: PoroSystem) -> None:
-    modes = shape_modes(system.mesh, TISSUE, GRAVITY, 0)
+    modes = uniform_strain_modes(system.mesh, TISSUE)
     wide = assemble(system.mesh, TISSUE, GRAVITY, system.hilum, system.hilum_displacement, modes)
     x = np.array([-8.0, 0.85, 2.0, -0.05, 0.02, 0.01, -0.04, 0.02, -0.03])
     state = solve(wide, Theta.of(x))
@@ -197,12 +197,12 @@ def test_slope_is_the_gradient_of_the_robust_cost_and_its_priors_at_frozen_weigh
     modes = hilum_modes(system.mesh, system.hilum)[:1]
     wide = assemble(system.mesh, TISSUE, GRAVITY, system.hilum, system.hilum_displacement, modes)
     target, settings = _target(system, truth, inner=12), FitSettings(kappa_decades=0.7)
-    problem = _Problem(wide, Observer(wide.mesh, target), settings, _worth(target, settings.correlation_mm))
+    problem = FitProblem.of(wide, target, settings)
     x = np.array([-7.4, 0.75, 3.0, 1.5])
 
     state = solve(wide, Theta.of(x), None, 1e-9)
     rows = problem.observer.residuals(state.u)
-    _, slope = _normal_equations(problem, rows, sensitivity(wide, state), x)
+    _, slope = problem.normal_equations(rows, sensitivity(wide, state), x)
     for k, h in enumerate((1e-4, 1e-4, 1e-3, 1e-3)):
         costs = []
         for theta in (x + h * np.eye(4)[k], x - h * np.eye(4)[k]):
@@ -212,35 +212,41 @@ def test_slope_is_the_gradient_of_the_robust_cost_and_its_priors_at_frozen_weigh
         assert slope[k] == pytest.approx(difference, rel=5e-3, abs=1e-3 * np.abs(slope).max())
 
 
-def test_a_start_where_no_suction_is_felt_comes_back_through_the_prior(system: PoroSystem, truth: PoroState) -> None:
-    """At 1e-13 the pressure drop is 1e-4 of what it can be: without a prior nothing pulls the fit away from there."""
+def test_a_start_where_no_pressure_is_felt_comes_back_through_the_prior(system: PoroSystem, truth: PoroState) -> None:
+    """At 1e-13 the pressure drop is 1e-4 of what it can be: without a prior nothing takes the fit away from there."""
     target, start = _target(system, truth), ((1e-13, 0.82, 6.0),)
-    lost = fit(system, target, FitSettings(starts=start, kappa_decades=np.inf, free=(True, False, False)))
-    found = fit(system, target, FitSettings(starts=start, free=(True, False, False)))
+    lost = fit_collapse(system, target, FitSettings(starts=start, kappa_decades=np.inf, free=(True, False, False)))
+    found = fit_collapse(system, target, FitSettings(starts=start, free=(True, False, False)))
     assert lost.theta.kappa_b < 1e-12
     assert np.log10(found.theta.kappa_b) == pytest.approx(np.log10(TRUE.kappa_b), abs=0.05)
 
 
 def test_identifiability_names_what_is_held_and_what_ended_at_a_bound(system: PoroSystem, truth: PoroState) -> None:
     target = _target(system, truth, inner=15)
-    known = identifiability(fit(system, target, FitSettings(starts=((2e-8, 0.82, 6.0),))), system)
+    known = identifiability(fit_collapse(system, target, FitSettings(starts=((2e-8, 0.82, 6.0),))), system)
     assert known.names == THETA_NAMES
     assert known.at_bound == ()
     assert_allclose(np.diag(known.correlation), 1, atol=1e-12)
     assert (np.diff(known.singular) <= 0).all()
-    # The information is that of the covariance: along the valley its inverse is the variance in units of the reach.
+    # The information is that of the covariance: along the valley its inverse is the variance, in longest steps.
     assert np.linalg.norm(known.valley) == pytest.approx(1)
-    information = np.linalg.inv(known.correlation * np.outer(known.sigma, known.sigma)) * np.outer(REACH, REACH)
+    information = np.linalg.inv(known.correlation * np.outer(known.sigma, known.sigma)) * np.outer(
+        STEP_SCALE, STEP_SCALE
+    )
     assert known.valley @ information @ known.valley == pytest.approx(known.singular[-1] ** 2)
-    still = fit(system, target, FitSettings(starts=((2e-8, 0.93, 0.0),), free=(True, False, True), max_steps=1))
+    still = fit_collapse(
+        system, target, FitSettings(starts=((2e-8, 0.93, 0.0),), free=(True, False, True), max_steps=1)
+    )
     assert identifiability(still, system).names == ("log10 kappa_b", "d_diaph_mm")
     down = _target(system, solve(system, Theta(2e-8, 0.82, 0.0)), inner=15)
-    ended = fit(system, replace(down, points=down.points - [0, 0, 4.0]), FitSettings(starts=((2e-8, 0.82, 3.0),)))
+    ended = fit_collapse(
+        system, replace(down, points=down.points - [0, 0, 4.0]), FitSettings(starts=((2e-8, 0.82, 3.0),))
+    )
     assert identifiability(ended, system).at_bound == ("d_diaph_mm",)
 
 
 def test_empty_targets_and_wrong_gravity_are_refused(system: PoroSystem) -> None:
     with pytest.raises(ValueError, match="no point of positive weight"):
-        fit(system, Target(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)))
+        fit_collapse(system, Target(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)))
     with pytest.raises(ValueError, match="unit vector"):
         assemble(system.mesh, TISSUE, 2 * GRAVITY, system.hilum, system.hilum_displacement)

@@ -8,11 +8,10 @@ from numpy.testing import assert_allclose
 from scipy.sparse import diags
 from shapes import box, ellipsoid, order
 
-from poro.assembly import consistent_mass, laplacian
-from poro.flow import Flow
+from poro.fem import Flow, Tissue
+from poro.fem.forms import consistent_mass, laplacian
+from poro.linalg import linear_solver
 from poro.mesh import TetMesh, stuff_level_set
-from poro.solver import linear_solver
-from poro.tissue import Tissue
 
 TISSUE = Tissue()
 

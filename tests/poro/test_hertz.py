@@ -10,11 +10,10 @@ from numpy.testing import assert_allclose
 from scipy.optimize import brentq
 from shapes import box, compliance_of, order
 
-from poro.contact import ContactState, ContactStatus, Obstacle, settle
-from poro.levelset import LevelSet
-from poro.mesh.tetmesh import Array, TetMesh
-from poro.solid import solid
-from poro.tissue import Tissue
+from poro.arrays import Array
+from poro.contact import ChestWall, ContactState, ContactStatus, LevelSet, solve_contact
+from poro.fem import Tissue, solid
+from poro.mesh import TetMesh
 
 TISSUE = Tissue()
 RADIUS, CONTACT = 400.0, 8.0  # mm; the wall's slope at the contact's edge is 1 : 50
@@ -91,8 +90,8 @@ def _indent(cells: int, finest: float) -> Indent:
     body = solid(mesh, TISSUE, held)
     free = body.solve(np.zeros_like(mesh.points), _half_space(mesh.points[held]))
     still = np.zeros(len(nodes), bool)
-    obstacle = Obstacle(_paraboloid(), mesh.points[nodes], still, np.array([0, 0, 1.0]), np.zeros(len(nodes)))
-    state = settle(compliance_of(body, nodes), obstacle, free[nodes], 0.0)
+    wall = ChestWall(_paraboloid(), mesh.points[nodes], still, np.array([0, 0, 1.0]), np.zeros(len(nodes)))
+    state = solve_contact(compliance_of(body, nodes), wall, free[nodes], 0.0)
     area = np.zeros(len(mesh.points))
     area[boundary.nodes] = boundary.node_areas
     return Indent(finest, state, mesh.points[nodes], area[nodes])
@@ -121,7 +120,7 @@ def test_force_radius_and_pressure_converge_to_hertz(indents: list[Indent]) -> N
     assert force[-1] < 0.035
     assert peak[-1] < 0.02
     for i in indents:
-        assert i.state.status is ContactStatus.SETTLED
+        assert i.state.status is ContactStatus.CONVERGED
         radius = np.sqrt(i.area[i.state.active].sum() / np.pi)
         assert radius == pytest.approx(CONTACT, abs=0.5 * i.finest)
 

@@ -8,6 +8,7 @@ from numpy.testing import assert_allclose
 from shapes import box, ellipsoid
 
 from poro.mesh import (
+    TetMesh,
     closest_points,
     interpolate,
     locate,
@@ -18,7 +19,7 @@ from poro.mesh import (
     stuff_level_set,
     surface,
 )
-from poro.mesh.tetmesh import TetMesh, dihedral_angles
+from poro.mesh.tetmesh import dihedral_angles
 
 
 def _ball(p: np.ndarray) -> np.ndarray:

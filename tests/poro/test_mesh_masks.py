@@ -7,9 +7,9 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy import ndimage
 
-from poro.mesh import locate, patches, quality, stuff, surface
+from poro.arrays import Array
+from poro.mesh import TetMesh, locate, patches, quality, stuff, surface
 from poro.mesh.stuffing import MIN_DIHEDRAL_DEG
-from poro.mesh.tetmesh import Array, TetMesh
 
 SPACING = np.array([1.5, 1.5, 2.5])
 

@@ -8,17 +8,16 @@ from scipy.sparse import diags
 from scipy.special import spherical_in
 from shapes import box, ellipsoid, order
 
-from poro.assembly import consistent_mass, deformation_gradient, gradient_load, laplacian
-from poro.choice import finite_problem
-from poro.finite import FiniteProblem, FiniteStatus, deform
-from poro.flow import Flow
-from poro.laws import Law, neo_hookean, saint_venant_kirchhoff
+from poro.arrays import Array
+from poro.collapse import PoroState, PoroSystem, Theta, assemble, solve
+from poro.collapse.choice import finite_problem
+from poro.collapse.finite_strain import FiniteProblem, FiniteStatus, deform
+from poro.fem import ConstitutiveModel, Flow, Tissue, neo_hookean, solid
+from poro.fem.constitutive import saint_venant_kirchhoff
+from poro.fem.forms import consistent_mass, deformation_gradient, gradient_load, laplacian
+from poro.fem.tissue import GRAVITY_KPA_PER_MM
+from poro.linalg import linear_solver
 from poro.mesh import TetMesh, stuff_level_set
-from poro.mesh.tetmesh import Array
-from poro.model import PoroState, PoroSystem, Theta, assemble, solve
-from poro.solid import solid
-from poro.solver import linear_solver
-from poro.tissue import GRAVITY_KPA_PER_MM, Tissue
 
 TISSUE, STRAIGHT = Tissue(), Tissue(poisson=0.0)
 HEIGHT = 40.0
@@ -88,8 +87,8 @@ def _column(cells: int, kappa_b: float) -> float:
 def test_column_sinks_by_the_closed_form() -> None:
     """nu = 0: E u' = alpha (p - p_s) with p = p_s cosh(z / l) / cosh(H / l)."""
     layer, steps = TISSUE.layer_mm(2e-8), [4.0, 2.0, 1.0]
-    pull = STRAIGHT.biot * STRAIGHT.pleural_kpa / STRAIGHT.young_kpa
-    exact = pull * (layer * np.tanh(HEIGHT / layer) - HEIGHT)
+    strain = STRAIGHT.biot * STRAIGHT.pleural_kpa / STRAIGHT.young_kpa
+    exact = strain * (layer * np.tanh(HEIGHT / layer) - HEIGHT)
     errors = [abs(_column(round(HEIGHT / step), 2e-8) / exact - 1) for step in steps]
     assert exact < -20
     assert order(steps, errors).min() > 1.8
@@ -140,28 +139,30 @@ def test_loads_do_twice_the_work_that_the_lung_stores(system: PoroSystem, theta:
 
 
 @pytest.mark.parametrize(
-    ("law", "theta"),
+    ("material", "theta"),
     [(saint_venant_kirchhoff(TISSUE), Theta(3e-10, 0.9)), (neo_hookean(TISSUE), Theta(1e-8, 0.85))],
     ids=["Saint Venant-Kirchhoff", "neo-Hookean"],
 )
-def test_finite_strain_stores_the_work_done_along_the_path(system: PoroSystem, law: Law, theta: Theta) -> None:
+def test_finite_strain_stores_the_work_done_along_the_path(
+    system: PoroSystem, material: ConstitutiveModel, theta: Theta
+) -> None:
     """Loads s P'(u) from s = 0 to 1 do P(1) - integral of P ds; neither a fixed hilum nor a rigid wall does any."""
-    problem = finite_problem(system, theta, law)
-    assert problem.suction is not None
-    suction = problem.suction
+    problem = finite_problem(system, theta, material)
+    assert problem.pressure_drop is not None
+    drop = problem.pressure_drop
 
     def at(share: float) -> tuple[float, Array]:
         part = FiniteProblem(
-            problem.mesh, law, problem.fixed, problem.imposed, share * problem.load, problem.wall, share * suction
+            problem.mesh, material, problem.fixed, problem.imposed, share * problem.load, problem.contact, share * drop
         )
         state = deform(part)
         assert state.status is FiniteStatus.SOLVED
         f = deformation_gradient(problem.mesh, state.u)
-        shrunk = float(suction * (1 - np.linalg.det(f)) @ problem.mesh.volumes)
+        shrunk = float(drop * (1 - np.linalg.det(f)) @ problem.mesh.volumes)
         return float((problem.load * state.u).sum()) + shrunk, f
 
     x, w = np.polynomial.legendre.leggauss(4)
     path = sum(float(weight) / 2 * at((node + 1) / 2)[0] for node, weight in zip(x, w, strict=True))
     end, f = at(1.0)
-    stored = float(law.respond(f)[0] @ problem.mesh.volumes)
+    stored = float(material.respond(f)[0] @ problem.mesh.volumes)
     assert end - path == pytest.approx(stored, rel=2e-3)

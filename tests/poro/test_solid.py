@@ -1,73 +1,99 @@
-"""Elasticity against closed forms: patch, rigid motions, gravity column, manufactured solution, and skfem's forms."""
+"""Elasticity against closed forms: patch, rigid motions, gravity column, manufactured solution, element matrices."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from scipy.sparse import csr_matrix
+from scipy.sparse import csr_matrix, identity
 from shapes import box, ellipsoid, order
-from skfem import Basis, BilinearForm, ElementTetP1, ElementVector, MeshTet
-from skfem.helpers import ddot, grad, sym_grad, trace
+from skfem import BilinearForm
+from skfem.helpers import grad
 
-from poro.assembly import (
+import poro.linalg.solver
+from poro.arrays import Array
+from poro.collapse.modes import eigenstrain_mode
+from poro.errors import SolverError
+from poro.fem import Tissue, solid
+from poro.fem.forms import (
     body_load,
     consistent_mass,
     deformation_gradient,
     eigenstress_load,
     gradient_load,
     laplacian,
+    lumped_mass,
     stiffness,
+    tangent_stiffness,
+    vector_basis,
 )
-from poro.mesh.tetmesh import Array, TetMesh
-from poro.modes import eigenstrain_mode
-from poro.solid import solid
-from poro.solver import Multigrid, linear_solver, rigid_modes
-from poro.tissue import GRAVITY_KPA_PER_MM, Tissue
+from poro.fem.tissue import GRAVITY_KPA_PER_MM
+from poro.linalg import Multigrid, linear_solver
+from poro.linalg.solver import rigid_body_modes
+from poro.mesh import TetMesh
 
 TISSUE = Tissue()
 
 
-def _basis(mesh: TetMesh, vector: bool) -> Basis:
-    return Basis(
-        MeshTet(mesh.points.T.copy(), mesh.tets.T.copy()), ElementVector(ElementTetP1()) if vector else ElementTetP1()
-    )
-
-
-def test_batched_assembly_equals_readable_forms() -> None:
+def test_scikit_fems_matrices_equal_products_over_the_elements() -> None:
+    """The closed forms of linear tetrahedra, element by element, and the batched tangent at constant moduli."""
     mesh = ellipsoid(20.0)
-    lame, mu = TISSUE.lame_kpa, TISSUE.shear_kpa
+    lame, mu, g, volume = TISSUE.lame_kpa, TISSUE.shear_kpa, mesh.gradients, mesh.volumes
+    eye = np.eye(3)
+
+    def near(ours: csr_matrix, local: Array, rows: int, columns: int) -> None:
+        """Against element matrices (m, 4, rows, 4, columns), summed one entry at a time."""
+        expected = np.zeros(ours.shape)
+        for a in range(4):
+            for b in range(4):
+                for i in range(rows):
+                    for j in range(columns):
+                        at = rows * mesh.tets[:, a] + i, columns * mesh.tets[:, b] + j
+                        np.add.at(expected, at, local[:, a, i, b, j])
+        assert np.abs(ours.toarray() - expected).max() <= 1e-12 * np.abs(expected).max()
+
+    moduli = lame * np.einsum("ij,kl->ijkl", eye, eye)
+    moduli = moduli + mu * (np.einsum("ik,jl->ijkl", eye, eye) + np.einsum("il,jk->ijkl", eye, eye))
+    elastic = np.einsum("maj,ijkl,mbl,m->maibk", g, moduli, g, volume)
+    near(stiffness(mesh, lame, mu), elastic, 3, 3)
+    near(laplacian(mesh), np.einsum("mai,mbi,m->mab", g, g, volume)[:, :, None, :, None], 1, 1)
+    mass = np.einsum("ab,m->mab", (np.ones((4, 4)) + np.eye(4)) / 20, volume)
+    near(consistent_mass(mesh), mass[:, :, None, :, None], 1, 1)
+    near(gradient_load(mesh), -np.einsum("mbi,m,a->maib", g, volume / 4, np.ones(4))[..., None], 3, 1)
+    assert_allclose(lumped_mass(mesh).toarray(), np.diag(mesh.node_volumes), rtol=1e-12)
+    assert_allclose(lumped_mass(mesh).diagonal(), np.asarray(consistent_mass(mesh).sum(axis=1)).ravel(), rtol=1e-12)
+    density, stress = np.array([0.3, -0.2, 0.7]), np.random.default_rng(0).normal(size=(len(mesh.tets), 3, 3))
+    assert_allclose(body_load(mesh, density), mesh.node_volumes[:, None] * density, rtol=1e-12)
+    force = np.zeros_like(mesh.points)
+    np.add.at(force, mesh.tets, np.einsum("mij,maj,m->mai", stress, g, volume))
+    assert_allclose(eigenstress_load(mesh, stress), force, atol=1e-12 * np.abs(force).max())
+
+
+def test_batched_tangent_equals_its_form() -> None:
+    """It stays a batched product for its speed; the equation is scikit-fem's, of moduli without any symmetry."""
+    mesh = ellipsoid(20.0)
+    moduli = np.random.default_rng(1).normal(size=(len(mesh.tets), 3, 3, 3, 3))
 
     @BilinearForm
-    def elasticity(u, v, w):  # type: ignore[no-untyped-def]
-        return lame * trace(grad(u)) * trace(grad(v)) + 2 * mu * ddot(sym_grad(u), sym_grad(v))
+    def tangent(u, v, w):  # type: ignore[no-untyped-def]
+        return np.einsum("ij...,ijkl...,kl...->...", grad(v), w.moduli, grad(u))
 
-    @BilinearForm
-    def diffusion(p, q, w):  # type: ignore[no-untyped-def]
-        return ddot(grad(p)[None], grad(q)[None])
+    form = tangent.assemble(vector_basis(mesh), moduli=moduli.transpose(1, 2, 3, 4, 0)[..., None])
+    assert abs(tangent_stiffness(mesh, moduli) - form).max() <= 1e-12 * abs(form).max()
 
-    @BilinearForm
-    def reaction(p, q, w):  # type: ignore[no-untyped-def]
-        return p * q
 
-    @BilinearForm
-    def push(p, v, w):  # type: ignore[no-untyped-def]
-        return -sum(grad(p)[k] * v[k] for k in range(3))
-
-    def near(ours: csr_matrix, theirs: csr_matrix) -> None:
-        assert abs(ours - theirs).max() <= 1e-12 * abs(theirs).max()
-
-    vector, scalar = _basis(mesh, True), _basis(mesh, False)
-    near(stiffness(mesh, lame, mu), elasticity.assemble(vector))
-    near(laplacian(mesh), diffusion.assemble(scalar))
-    near(consistent_mass(mesh), reaction.assemble(scalar))
-    near(gradient_load(mesh), push.assemble(scalar, vector))
+def test_the_stiffness_is_made_once_for_a_mesh_and_material() -> None:
+    mesh = ellipsoid(25.0)
+    first = stiffness(mesh, 0.5, 0.2)
+    assert stiffness(mesh, 0.5, 0.2) is first
+    assert stiffness(TetMesh(mesh.points, mesh.tets), 0.5, 0.2) is not first
+    assert abs(stiffness(mesh, 1.0, 0.4) - 2 * first).max() <= 1e-12 * abs(first).max()
 
 
 def test_rigid_motions_cost_no_energy() -> None:
     mesh = ellipsoid(16.0)
     matrix = stiffness(mesh, TISSUE.lame_kpa, TISSUE.shear_kpa)
-    modes = rigid_modes(mesh.points)
+    modes = rigid_body_modes(mesh.points)
     assert_allclose(matrix @ modes, 0, atol=1e-10 * abs(matrix).max() * np.abs(modes).max())
     assert abs(matrix - matrix.T).max() < 1e-12 * abs(matrix).max()
 
@@ -144,7 +170,7 @@ def test_eigenstress_is_in_balance() -> None:
     stress = np.random.default_rng(0).normal(size=(len(mesh.tets), 3, 3))
     stress = stress + stress.transpose(0, 2, 1)
     force = eigenstress_load(mesh, stress)
-    assert_allclose(rigid_modes(mesh.points).T @ force.ravel(), 0, atol=1e-8)
+    assert_allclose(rigid_body_modes(mesh.points).T @ force.ravel(), 0, atol=1e-8)
 
 
 @pytest.mark.parametrize("poisson", [0.35, 0.45])
@@ -166,6 +192,24 @@ def test_multigrid_agrees_with_the_factorization(poisson: float) -> None:
     assert (residuals[-1] / residuals[0]) ** (1 / (len(residuals) - 1)) < 0.5
     many = direct.solve(np.stack([right, 2 * right], 1))
     assert_allclose(many[:, 1], 2 * exact, rtol=1e-9, atol=1e-9 * np.abs(exact).max())
+
+
+def test_multigrid_that_runs_out_of_iterations_says_so_with_its_residuals(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(poro.linalg.solver, "MAX_ITERATIONS", 3)
+    matrix = laplacian(box((12, 12, 12), (30.0, 30.0, 30.0))) + 1e-3 * identity(13**3)
+    solver = linear_solver(matrix.tocsr(), np.random.default_rng(0).normal(size=(13**3, 3)), limit=0)
+    with pytest.raises(SolverError, match="after 3 iterations") as stopped:
+        solver.solve(np.random.default_rng(1).normal(size=13**3))
+    residuals = stopped.value.residuals
+    assert len(residuals) == 4
+    assert residuals[0] == 1
+    assert 1e-10 < residuals[-1] < 0.5
+
+
+def test_a_body_that_its_constraints_leave_free_has_no_answer() -> None:
+    mesh = ellipsoid(25.0)
+    with pytest.raises(SolverError, match="move freely"):
+        solid(mesh, TISSUE, np.zeros(0, int), csr_matrix((3 * len(mesh.points), 3 * len(mesh.points))))
 
 
 def test_a_body_that_nothing_holds_is_refused() -> None:

@@ -1,4 +1,4 @@
-"""Correspondences are believed for a reason: votes of the nearest places, the way there and back, moves_with_neighbours motion."""
+"""Correspondences are believed for a reason: votes of the nearest places, the way there and back, motion like the neighbours'."""
 
 from __future__ import annotations
 

@@ -15,14 +15,14 @@ from typing import Any
 
 import numpy as np
 
-from poro.choice import Chosen
-from poro.choice import Model as Strain
-from poro.extrapolate import Extrapolation, ExtrapolationStatus
-from poro.fit import Fit, FitStatus, FitStep
-from poro.flow import Flow
+from poro.collapse import PoroState, PoroStatus, Theta
+from poro.collapse import StrainMeasure as Strain
+from poro.collapse.choice import StrainChoice
+from poro.fem import Extrapolation, Flow, Tissue
+from poro.fem.extrapolation import ExtrapolationStatus
+from poro.fit import Fit, FitStatus
+from poro.fit.trust_region import FitStep
 from poro.mesh import TetMesh, stuff_level_set
-from poro.model import PoroState, PoroStatus, Theta
-from poro.tissue import Tissue
 from registration.correspondences import Correspondences
 from registration.ffd import FfdFit
 from registration.maps.inversion import Inversion
@@ -255,7 +255,7 @@ def _collapse(lung: TetMesh) -> Collapse:
     before = TetMesh(DEF_FROM_INF_RIGID(INF_FROM_CT(lung.points)), lung.tets)
     model_mesh = ball_mesh(before.points.mean(axis=0), 48.0, 24.0)
     after = TetMesh(AFTER_FROM_BEFORE(before.points), lung.tets)
-    solid = Chosen(_state(model_mesh), Strain.LINEAR, "strains little", 0.0004, None)
+    solid = StrainChoice(_state(model_mesh), Strain.LINEAR, "strains little", 0.0004, None)
     system: Any = SimpleNamespace(mesh=model_mesh, modes=(), flow=Flow(model_mesh, Tissue()))
     nothing = np.zeros((0, 3))
     found: Any = SimpleNamespace(is_collapsed=True, lung=ball(DEFLATED_GRID, DEF_FROM_CT(CENTRE), 18.0))

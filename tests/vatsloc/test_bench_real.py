@@ -11,8 +11,8 @@ import pytest
 from matplotlib.axes import Axes
 from numpy.testing import assert_allclose
 
+from poro.arrays import Array
 from poro.mesh import TetMesh
-from poro.mesh.tetmesh import Array
 from registration.volume import Mask
 from vatsloc.errors import CaseError, InputRefused
 from vatsloc.study import bench_real as bench

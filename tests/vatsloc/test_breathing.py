@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from poro.arrays import Array
+from poro.fem import Tissue
+from poro.fem.tissue import GRAVITY_KPA_PER_MM
 from poro.mesh import TetMesh, stuff
-from poro.mesh.tetmesh import Array
-from poro.tissue import GRAVITY_KPA_PER_MM, Tissue
 from vatsloc.study.breathing import WALL_ALONE, Breathing, Lung, breathe_out, bronchi, caudal, hilum, spread_map
 
 HALF = np.array([35.0, 55.0, 75.0])

@@ -10,13 +10,12 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from poro.choice import Chosen
-from poro.choice import Model as Strain
-from poro.fit import Fit, FitSettings, FitStatus
+from poro.collapse import PoroStatus, Theta
+from poro.collapse import StrainMeasure as Strain
+from poro.collapse.choice import StrainChoice
+from poro.fem import Tissue
+from poro.fit import Fit, FitSettings, FitStatus, Target
 from poro.mesh import TetMesh
-from poro.model import PoroStatus, Theta
-from poro.observations import Target
-from poro.tissue import Tissue
 from registration.correspondences import Correspondences
 from registration.volume import Array
 from tests.vatsloc import ball_scene as scene
@@ -64,7 +63,7 @@ def a_fit(displacement: Array, settled: bool = True, tets: int = 1, inverted: fl
     det = np.where(np.arange(tets) < inverted * tets, -1.0, 1.0)
     state = SimpleNamespace(u=displacement, det_f=det, status=PoroStatus.SOLVED)
     if not settled:
-        state.status = PoroStatus.NOT_SETTLED
+        state.status = PoroStatus.NOT_CONVERGED
     return _Fit(Theta(1e-7, 0.6, 3.0), state)
 
 
@@ -295,7 +294,7 @@ class Climb:
         )
         self.others = np.full((4, *lung.points.shape), 2.0)
         system = SimpleNamespace(mesh=lung, gravity=GRAVITY, hilum=HILUM)
-        chosen = Chosen(self.solid, Strain.FINITE, "because", 0.01, None)
+        chosen = StrainChoice(self.solid, Strain.FINITE, "because", 0.01, None)
         for name, answer in (
             ("assemble", system),
             ("fit", self.plain),

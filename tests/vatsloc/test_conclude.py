@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from poro.collapse import PoroStatus, Theta
 from poro.fit import FitStatus
-from poro.model import PoroStatus, Theta
 from registration.volume import Mask
 from tests.vatsloc import run_scene as known
 from vatsloc.errors import NotConverged
@@ -115,7 +115,7 @@ def test_every_gate_is_there_and_one_that_fails_marks_the_result() -> None:
 def test_a_contact_that_did_not_settle_has_no_answer(fit_status: FitStatus, forward: PoroStatus) -> None:
     state = replace(known.scene().collapse.fit.state, status=forward)
     scene = known.scene().with_fit(status=fit_status, state=state)
-    if fit_status is FitStatus.CONTACT or forward is PoroStatus.NOT_SETTLED:
+    if fit_status is FitStatus.CONTACT or forward is PoroStatus.NOT_CONVERGED:
         with pytest.raises(NotConverged, match="contact of the collapsing lung did not settle"):
             concluded(scene)
     else:

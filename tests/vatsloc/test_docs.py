@@ -77,7 +77,7 @@ def test_own_case_page_s_tables_are_known_to_the_readers() -> None:
 def test_extend_page_s_metric_and_material_hold_what_it_asserts() -> None:
     names = run(ROOT / "docs" / "extend.md")
     assert names["fit"].min_det > 0
-    assert names["law"].name == "neo-Hookean with a quadratic bulk term"
+    assert names["material"].name == "neo-Hookean with a quadratic bulk term"
 
 
 @pytest.mark.parametrize("page", [*PAGES, ROOT / "README.md"], ids=lambda page: page.name)

@@ -8,15 +8,13 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from poro.choice import keep_in_range
-from poro.fit import Fit, FitSettings, fit
-from poro.laws import neo_hookean
+from poro.collapse import Theta, assemble, keep_in_range, solve
+from poro.fem import Tissue, neo_hookean
+from poro.fit import Fit, FitSettings, Target, fit_collapse
 from poro.mesh import TetMesh, stuff
-from poro.model import Theta, assemble, solve
-from poro.observations import Target
-from poro.tissue import Tissue
 from registration.correspondences import Correspondences
-from vatsloc.workflow.ladder import NO_OTHERS, Model, Step, best_of, corrected, held_back, misfit
+from vatsloc.workflow.ladder import NO_OTHERS, Model, Step, best_of, corrected, fit_settings, held_back, misfit
+from vatsloc.workflow.settings import settings_of
 from vatsloc.workflow.spread import other_answers
 
 GRADIENT = np.array([[-0.1, 0.02, 0.0], [0.03, -0.05, 0.04], [0.0, -0.02, 0.08]])
@@ -47,7 +45,7 @@ def still(lung: TetMesh) -> Model:
     hilum = np.flatnonzero(np.linalg.norm(lung.points - [-50, 0, 0], axis=1) < 25)
     system = assemble(lung, Tissue(), np.array([1.0, 0, 0]), hilum, np.zeros((len(hilum), 3)))
     boundary = lung.boundary
-    found: Fit = fit(system, Target(boundary.points, boundary.node_normals, np.ones(len(boundary.points))))
+    found: Fit = fit_collapse(system, Target(boundary.points, boundary.node_normals, np.ones(len(boundary.points))))
     nothing = np.zeros_like(lung.points)
     solid = keep_in_range(system, found.state, neo_hookean(Tissue()))
     return Model(system, replace(found, state=replace(found.state, u=nothing)), nothing, _pairs(), (), solid, NO_OTHERS)
@@ -61,7 +59,7 @@ def _pairs(noise_mm: float = 0.0, smooth: bool = True) -> Correspondences:
 
 
 def _steps() -> dict[str, Step]:
-    return {f"strain {strain:g}": corrected(strain) for strain in (0.05, 0.0125)}
+    return {f"strain {strain:g}": corrected(strain, FitSettings()) for strain in (0.05, 0.0125)}
 
 
 def test_misfit_is_the_median_distance(lung: TetMesh) -> None:
@@ -103,11 +101,24 @@ def test_a_step_that_fails_with_all_pairs_gives_way_to_the_next_best(still: Mode
     everything = len(still.pairs)
 
     def fails(model: Model, target: Target, start: Fit) -> Model:
-        return model if len(target.inflated) == everything else corrected(0.05)(model, target, start)
+        return model if len(target.inflated) == everything else corrected(0.05, FitSettings())(model, target, start)
 
-    model, _ = best_of({"fails": fails, "holds": corrected(0.0125)}, still, still, surface)
+    model, _ = best_of({"fails": fails, "holds": corrected(0.0125, FitSettings())}, still, still, surface)
     assert {rung.name: rung.kept for rung in model.rungs} == {"fails": False, "holds": True}
     assert np.abs(model.displacement).max() > 1.0
+
+
+def test_the_standard_deviation_of_keypoints_in_the_settings_reaches_the_correction(
+    still: Model, surface: Target
+) -> None:
+    """The surer they are said to be, the closer they are followed."""
+    target = replace(surface, inflated=still.pairs.moving, deflated=still.pairs.fixed, keypoint_weights=np.ones(300))
+    left = []
+    for sigma_mm in (0.5, 50.0):
+        settings = fit_settings(settings_of("balanced", {"keypoints": {"sigma_mm": sigma_mm}}))
+        found = corrected(0.05, settings)(still, target, still.fit)
+        left.append(misfit(still.system.mesh, found.displacement, still.pairs))
+    assert left[0] < 0.5 * left[1]
 
 
 def test_noise_alone_is_not_worth_a_rung(still: Model) -> None:
@@ -126,7 +137,7 @@ def test_other_answers_follow_the_inputs_and_agree_where_the_surface_tells_all(l
     boundary = lung.boundary.moved(lung.boundary.points + truth.u[lung.boundary.nodes])
     seen = Target(boundary.points, boundary.node_normals, np.ones(len(boundary.points)))
     settings = FitSettings(free=(True, True, False))
-    best = fit(system, seen, settings)
+    best = fit_collapse(system, seen, settings)
     others = other_answers(system, seen, best, settings)
     at_hilum = np.linalg.norm(others[:, system.hilum].mean(axis=1), axis=1)
     moved = others[np.abs(at_hilum - 3) < 1e-6]

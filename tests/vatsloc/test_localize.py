@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from poro.fem import Tissue
 from poro.mesh import TetMesh
-from poro.tissue import Tissue
 from registration.maps.rigid import RigidTransform
 from vatsloc.case import read_case
 from vatsloc.evaluation import evaluate_case

@@ -10,13 +10,11 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from poro.correct import correct, pull_of
-from poro.extrapolate import extrapolate
-from poro.fit import FitSettings, fit
+from poro.collapse import Theta, assemble, solve
+from poro.collapse.solution import sensitivity
+from poro.fem import Tissue, extrapolate
+from poro.fit import FitSettings, Target, constraints_to, elastic_correction, fit_collapse
 from poro.mesh import TetMesh, interpolate, locate
-from poro.model import Theta, assemble, sensitivity, solve
-from poro.observations import Target
-from poro.tissue import Tissue
 from registration.correspondences import Correspondences
 from registration.volume import Array
 from tests.vatsloc import ball_scene as scene
@@ -109,8 +107,8 @@ def target_of(u: Array) -> Target:
 def test_a_correction_is_the_same_field() -> None:
     u = wavy(BALL.points)
     start = 0.4 * u
-    found = correct(BALL, start, Tissue(), pull_of(target_of(u), BALL, start)).u
-    again = correct(SHUFFLED, start[ORDER], Tissue(), pull_of(target_of(u), SHUFFLED, start[ORDER])).u
+    found = elastic_correction(BALL, start, Tissue(), constraints_to(target_of(u), BALL, start)).u
+    again = elastic_correction(SHUFFLED, start[ORDER], Tissue(), constraints_to(target_of(u), SHUFFLED, start[ORDER])).u
     assert_allclose(again, found[ORDER], atol=1e-6)
     assert np.linalg.norm(found + start - u, axis=1).mean() < 0.5 * np.linalg.norm(start - u, axis=1).mean()
 
@@ -132,7 +130,7 @@ def test_a_solved_and_a_fitted_lung_are_the_same() -> None:
     assert_allclose(again.u, state.u[ORDER], atol=2e-3)
     assert_allclose(sensitivity(other, again), sensitivity(system, state)[ORDER], atol=0.05)
     settings = FitSettings(max_steps=4)
-    one, two = (fit(lung, target_of(state.u), settings) for lung in (system, other))
+    one, two = (fit_collapse(lung, target_of(state.u), settings) for lung in (system, other))
     assert_allclose(two.theta.vector(), one.theta.vector(), atol=0.05)
     assert_allclose(two.state.u, one.state.u[ORDER], atol=0.05)
 

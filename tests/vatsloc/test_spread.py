@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from poro.fit import FitSettings
-from poro.model import PoroStatus, PoroSystem, Theta
-from poro.observations import Target
+from poro.collapse import PoroStatus, PoroSystem, Theta
+from poro.fit import FitSettings, Target
 from registration.volume import Array
 from vatsloc.workflow import spread
 
@@ -66,10 +65,10 @@ def test_starts_count_where_they_end_as_well_as_the_best(monkeypatch: pytest.Mon
 
 
 def test_tries_that_did_not_settle_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    status = {3: PoroStatus.NOT_SETTLED, 4: PoroStatus.INVERTED}
+    status = {3: PoroStatus.NOT_CONVERGED, 4: PoroStatus.INVERTED}
     far, _ = answers(monkeypatch, status=status)
     assert_allclose(far[:, 0, 0], [3.0, 5.0, 6.0, 7.0, 8.0, 9.0])
-    none, _ = answers(monkeypatch, status=dict.fromkeys(range(9), PoroStatus.NOT_SETTLED))
+    none, _ = answers(monkeypatch, status=dict.fromkeys(range(9), PoroStatus.NOT_CONVERGED))
     assert none.shape == (0, 1, 3)
 
 

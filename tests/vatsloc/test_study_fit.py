@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from poro.identify import THETA_NAMES
+from poro.collapse import PoroSystem, Theta, assemble, solve
+from poro.fem import Tissue
+from poro.fit import Target
+from poro.fit.identifiability import THETA_NAMES
 from poro.mesh import stuff_level_set
-from poro.model import PoroSystem, Theta, assemble, solve
-from poro.observations import Target
-from poro.tissue import Tissue
 from vatsloc.imaging.surface import Border, SurfacePoints
 from vatsloc.study.stability_fit import DISTURBANCES, identifiability, page, random_starts
 from vatsloc.workflow.observe import Observed

@@ -11,9 +11,9 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.sparse import csr_matrix
 
+from poro.fem import Tissue
 from poro.mesh import TetMesh
 from poro.mesh.tetmesh import dihedral_angles
-from poro.tissue import Tissue
 from vatsloc.study import bench_poro as bench
 from vatsloc.study import cost_poro as cost
 from vatsloc.study import stability_poro as stability
@@ -62,8 +62,8 @@ def test_lung_has_the_size_and_hold_asked_for(tets: int) -> None:
 
 def test_sampled_wall_equals_its_expression() -> None:
     system = system_of(lung(2_000), Tissue(), smooth_wall())
-    moved = system.obstacle.rest + np.random.default_rng(0).uniform(-8, 8, system.obstacle.rest.shape)
-    assert_allclose(system.obstacle.level.evaluate(moved)[0], wall_level(moved), atol=1e-3)
+    moved = system.wall.rest + np.random.default_rng(0).uniform(-8, 8, system.wall.rest.shape)
+    assert_allclose(system.wall.level.evaluate(moved)[0], wall_level(moved), atol=1e-3)
 
 
 def test_exponent_of_a_power_law() -> None:

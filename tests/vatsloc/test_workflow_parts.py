@@ -7,10 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from poro.errors import SolverError
 from poro.mesh import TetMesh, stuff_level_set
 from registration.maps.rigid import RigidTransform
 from registration.volume import Grid, Mask
-from vatsloc.errors import CaseError, InputRefused
+from vatsloc.errors import CaseError, InputRefused, NotConverged
 from vatsloc.maps import MeshMap, covered, sampled
 from vatsloc.workflow.gates import at_least, at_most
 from vatsloc.workflow.localize import in_view
@@ -104,6 +105,9 @@ def test_stages_are_timed_and_refusals_named() -> None:
         stages.stage("two"),
     ):
         raise ValueError("empty mask")
+    for failed in (SolverError("singular"), np.linalg.LinAlgError("singular")):
+        with pytest.raises(NotConverged, match="The stage 'two' has no answer: singular"), stages.stage("two"):
+            raise failed
     assert list(stages.seconds) == ["one"]
     assert 0 <= stages.seconds["one"] <= stages.total_seconds
     assert stages.peak_mb["one"] > 1

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from poro.mesh import closest_points
-from poro.mesh.tetmesh import Array, TriSurface
+from poro.arrays import Array
+from poro.mesh import TriSurface, closest_points
 
 _ROUNDS = 40
 _HUBER_MM = 3.0

@@ -10,12 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from poro.mesh.tetmesh import Array
-from poro.model import PoroSystem, Theta, solve, solve_many, without_wall
-from poro.tissue import Tissue
+from poro.arrays import Array
+from poro.collapse import PoroSystem, Theta, solve
+from poro.collapse.model import without_wall
+from poro.fem import Tissue
 from vatsloc.study.cost_poro import STAGES, cost_rows, measure_sizes, warm
 from vatsloc.study.getfem_peer import GetfemAnswer, getfem_python, run_getfem
 from vatsloc.study.poro_lung import Lung, lung, smooth_wall, system_of
+from vatsloc.study.sweep import solve_many
 from vatsloc.study.tables import Row, markdown
 
 COMPARED_TETS = 28_000
@@ -26,11 +28,12 @@ _BOUNDS = """What bounds our seconds. Cold: the factor and the compliance of the
 products near the processor's peak (9 and 65 Gflop for 1708 nodes). The lung without wall alone takes about a tenth of
 GetFEM's time with it, so that no contact solver could make a cold start much more than ten times faster. Warm: a value
 alone takes about seven linearizations from no contact and twice as many active sets, each a dense Cholesky factor of
-the nodes in contact and a pass over their compliance, 105 MB, as fast as memory allows. In a sweep the values go in
-lock-step, so that one pass serves up to 48 of them as a product of matrices, start between the loads solved before
-(about five linearizations), and keep a factor while at most 30 nodes come or go (about two factors a value). The lung's
-pressures, some eight factors of the flow, are a tenth of the sweep. Exponents leave out the multigrid row. Contact
-needs the factor: beyond 6,000 contact nodes or with multigrid the table stops at the lung without wall."""
+the nodes in contact and a pass over their compliance, 105 MB, as fast as memory allows. In a sweep a batched active set
+of the benchmark's own advances up to 48 values together, so that one pass serves them as a product of matrices; they
+start between the loads solved before (about five linearizations) and keep a factor while at most 30 nodes come or go
+(about two factors a value). The lung's pressures, some eight factors of the flow, are a tenth of the sweep. Exponents
+leave out the multigrid row. Contact needs the factor: beyond 6,000 contact nodes or with multigrid the table stops at
+the lung without wall."""
 
 _KEYS = """In the command's JSON `getfem.speedup_single` and `getfem.speedup_sweep50` are the last table's rows "wall,
 warm" and "wall, 50 values, warm": pressure, weight, hilum and contact of each new value, on a lung whose mesh, factor
@@ -92,7 +95,7 @@ def _our_seconds(body: Lung, thetas: list[Theta], chosen: list[Theta]) -> tuple[
 
     system = timed("set-up", lambda: system_of(body, _TISSUE, smooth_wall()))
     timed("without wall, first", lambda: without_wall(system, thetas[0]))
-    timed("compliance", lambda: system.compliance.groups(system.obstacle.rest))
+    timed("compliance", lambda: system.compliance.groups(system.wall.rest))
     timed("with wall, first", lambda: solve(system, thetas[0]))
     # Every value is new to the lung, and contact starts from none.
     for name, work in (("without wall", without_wall), ("with wall", solve)):

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from poro.arrays import Array
 from poro.mesh import TetMesh, interpolate, locate
-from poro.mesh.tetmesh import Array
 from vatsloc.evaluation.statistics import distances, summarize
 from vatsloc.study.affine import affine_to_points, affine_to_shape
 from vatsloc.study.breathing import WALL_ALONE, Breathing, Lung, breathe_out

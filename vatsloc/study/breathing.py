@@ -2,7 +2,7 @@
 under its weight, is held lengthwise by its bronchi and turns with the ribs.
 
 Of the breath only the shape before and after is known. Lengths in mm, RAS but for the sign of z, which the lung's own
-shape decides; moduli are those of `poro.tissue.Tissue`.
+shape decides; moduli are those of `poro.fem.tissue.Tissue`.
 """
 
 from __future__ import annotations
@@ -12,13 +12,14 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import coo_matrix, csr_matrix, diags, vstack
 
-from poro.assembly import stiffness
+from poro.arrays import Array
+from poro.fem import Tissue
+from poro.fem.constraints import point_constraints
+from poro.fem.forms import stiffness
+from poro.fem.tissue import GRAVITY_KPA_PER_MM
+from poro.linalg import linear_solver
 from poro.mesh import TetMesh, closest_points
 from poro.mesh.patches import INWARD
-from poro.mesh.tetmesh import Array
-from poro.solver import linear_solver
-from poro.springs import springs
-from poro.tissue import GRAVITY_KPA_PER_MM, Tissue
 from vatsloc.imaging.lungs import Side
 from vatsloc.study.affine import Affine
 
@@ -143,7 +144,9 @@ def _wall(lung: Lung, rest: TetMesh, u: Array, mediastinal: float, robust_mm: fl
     area = np.concatenate([onto.node_areas, moved.node_areas]) * used / 2
     weight = WALL_KPA_PER_MM * area * np.where(inward, mediastinal, 1.0) / (1 + (along / robust_mm) ** 2)
     wanted = along + np.einsum("qd,qd->q", operator @ u, normal)
-    return springs(operator, weight[:, None, None] * normal[:, :, None] * normal[:, None, :], wanted[:, None] * normal)
+    return point_constraints(
+        operator, weight[:, None, None] * normal[:, :, None] * normal[:, None, :], wanted[:, None] * normal
+    )
 
 
 def _rows(nodes: Array, weights: Array, n: int) -> csr_matrix:

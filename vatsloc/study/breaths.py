@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from scipy import ndimage
 
+from poro.arrays import Array
 from poro.mesh import TetMesh, stuff
-from poro.mesh.tetmesh import Array
 from registration.images.resample import resample_mask
 from registration.volume import Mask
 from vatsloc.errors import CaseError, InputRefused

@@ -6,9 +6,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from poro.model import Theta, solve, without_wall
-from poro.solver import Multigrid
-from poro.tissue import Tissue
+from poro.collapse import Theta, solve
+from poro.collapse.model import without_wall
+from poro.fem import Tissue
+from poro.linalg import Multigrid
 from vatsloc.study.isolated import isolated
 from vatsloc.study.poro_lung import lung, smooth_wall, system_of
 from vatsloc.study.tables import Row
@@ -47,7 +48,7 @@ def measure_size(tets: int) -> Row:
     iterative = isinstance(system.solid.solver, Multigrid)
     if not iterative and len(system.contact_nodes) <= MOST_CONTACT_NODES:
         with stages.stage("compliance"):
-            system.compliance.groups(system.obstacle.rest)
+            system.compliance.groups(system.wall.rest)
         with stages.stage("contact"):
             first = solve(system, THETA)
         with stages.stage("next value"):

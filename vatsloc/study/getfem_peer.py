@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-from poro.mesh.tetmesh import Array
-from poro.model import PoroSystem, Theta
-from poro.tissue import GRAVITY_KPA_PER_MM
+from poro.arrays import Array
+from poro.collapse import PoroSystem, Theta
+from poro.fem.tissue import GRAVITY_KPA_PER_MM
 from vatsloc.errors import VatslocError
 from vatsloc.study.poro_lung import WALL
 
@@ -49,10 +49,10 @@ def getfem_python() -> str | None:
 def run_getfem(python: str, system: PoroSystem, thetas: list[Theta]) -> GetfemAnswer:
     """Solve a system in front of `WALL` at several parameter values by GetFEM; raises VatslocError when it fails."""
     mesh, tissue, n = system.mesh, system.tissue, len(system.mesh.points)
-    offset, moving, pull = np.zeros(n), np.zeros((n, 3)), np.zeros((n, 3))
-    offset[system.contact_nodes] = system.obstacle.offset
-    moving[system.contact_nodes] = system.obstacle.moving[:, None] * system.obstacle.axis
-    pull[system.hilum] = system.hilum_displacement
+    offset, moving, imposed = np.zeros(n), np.zeros((n, 3)), np.zeros((n, 3))
+    offset[system.contact_nodes] = system.wall.offset
+    moving[system.contact_nodes] = system.wall.moving[:, None] * system.wall.axis
+    imposed[system.hilum] = system.hilum_displacement
     with tempfile.TemporaryDirectory() as folder:
         source, target = Path(folder) / "problem.npz", Path(folder) / "answer.npz"
         np.savez(
@@ -60,7 +60,7 @@ def run_getfem(python: str, system: PoroSystem, thetas: list[Theta]) -> GetfemAn
             points=mesh.points,
             tets=mesh.tets,
             hilum=system.hilum,
-            pull=pull,
+            imposed=imposed,
             offset=offset,
             moving=moving,
             wall=WALL,

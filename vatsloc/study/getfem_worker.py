@@ -89,10 +89,10 @@ def elastic(lung: Lung, data: Any, p: Any, density: float) -> Any:
     for name in ("lame", "shear", "biot"):
         model.add_initialized_data(name, float(data[name]))
     model.add_initialized_data("weight", density * data["weight"])
-    model.add_initialized_fem_data("pull", lung.vector, lung.field(data["pull"]))
+    model.add_initialized_fem_data("imposed", lung.vector, lung.field(data["imposed"]))
     model.add_isotropic_linearized_elasticity_brick(lung.exact, "u", "lame", "shear")
     model.add_linear_term(lung.exact, "biot*Grad_p.Test_u - weight.Test_u")
-    model.add_Dirichlet_condition_with_simplification("u", HILUM, "pull")
+    model.add_Dirichlet_condition_with_simplification("u", HILUM, "imposed")
     return model
 
 

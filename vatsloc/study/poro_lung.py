@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from poro.levelset import LevelSet
+from poro.arrays import Array
+from poro.collapse import PoroSystem, assemble
+from poro.contact import LevelSet
+from poro.fem import Tissue
 from poro.mesh import TetMesh, stuff_level_set
-from poro.mesh.tetmesh import Array
-from poro.model import PoroSystem, assemble
-from poro.tissue import Tissue
 
 RADII_MM = np.array([45.0, 65.0, 100.0])
 # An ellipsoid with a bay for the heart and a dome for the diaphragm, 1 l; positive inside, in mm.
@@ -56,7 +56,7 @@ def lung(tets: int, hilum_radius_mm: float = 22.0) -> Lung:
 
 def system_of(body: Lung, tissue: Tissue, wall: LevelSet | None = None) -> PoroSystem:
     """The lung set up inside a wall, by default its own outline."""
-    return assemble(body.mesh, tissue, GRAVITY, body.hilum, body.hilum_displacement, wall=wall)
+    return assemble(body.mesh, tissue, GRAVITY, body.hilum, body.hilum_displacement, wall_level=wall)
 
 
 def smooth_wall(step_mm: float = 2.0) -> LevelSet:

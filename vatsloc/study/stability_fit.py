@@ -10,11 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
-from poro import identify
-from poro.fit import FitStatus, bounds, fit
-from poro.model import PoroSystem, assemble
-from poro.observations import Target
-from poro.tissue import Tissue
+from poro.collapse import PoroSystem, assemble
+from poro.fem import Tissue
+from poro.fit import FitStatus, Target, fit_collapse
+from poro.fit import identifiability as identifiability_of
+from poro.fit.identifiability import THETA_NAMES
+from poro.fit.problem import bounds
 from registration.maps.rigid import RigidTransform
 from registration.volume import Array
 from vatsloc.case import Case, read_case
@@ -114,7 +115,7 @@ def random_starts(system: PoroSystem, target: Target, settings: Settings, count:
     fits, began = [], time.process_time()
     for _ in range(count):
         x = rng.uniform(low, high)
-        fits.append(fit(system, target, replace(fit_settings(settings), starts=((10 ** x[0], x[1], x[2]),))))
+        fits.append(fit_collapse(system, target, replace(fit_settings(settings), starts=((10 ** x[0], x[1], x[2]),))))
     costs = np.array([float(found.costs[0]) for found in fits])
     good = costs < 1.02 * costs.min()
     best = fits[int(np.argmin(costs))].state.u
@@ -126,7 +127,7 @@ def random_starts(system: PoroSystem, target: Target, settings: Settings, count:
         "farthest apart there, mm": round(max(apart), 2),
         "elsewhere, said to be settled": sum(found.status is FitStatus.CONVERGED for found in elsewhere),
         "default start over the best cost, %": round(
-            100 * (float(fit(system, target, fit_settings(settings)).costs[0]) / costs.min() - 1), 1
+            100 * (float(fit_collapse(system, target, fit_settings(settings)).costs[0]) / costs.min() - 1), 1
         ),
         "core seconds a start": round((time.process_time() - began) / count, 1),
     }
@@ -137,19 +138,19 @@ def identifiability(system: PoroSystem, target: Target, settings: Settings) -> l
     cost rises when it is held off by a tenth of its range and the others are fitted again.
     """
     chosen = fit_settings(settings)
-    best = fit(system, target, chosen)
-    known = identify.identifiability(best, system)
+    best = fit_collapse(system, target, chosen)
+    known = identifiability_of(best, system)
     others = known.correlation - np.eye(len(known.names))
     low, high = (b[:3] for b in bounds(system))
     theta, rows = best.theta.vector()[:3], []
     for row, name in enumerate(known.names):
-        k = identify.THETA_NAMES.index(name)
+        k = THETA_NAMES.index(name)
         rises = []
         for sign in (-1, 1):
             x = theta.copy()
             x[k] = np.clip(x[k] + sign * 0.1 * (high[k] - low[k]), low[k], high[k])
             free = tuple(bool(i != k and chosen.free is not None and chosen.free[i]) for i in range(3))
-            held = fit(system, target, replace(chosen, free=free, starts=((10 ** x[0], x[1], x[2]),)))
+            held = fit_collapse(system, target, replace(chosen, free=free, starts=((10 ** x[0], x[1], x[2]),)))
             rises.append(round(100 * (float(held.costs[0]) / float(best.costs[0]) - 1), 1))
         rows.append(
             {

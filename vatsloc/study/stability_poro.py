@@ -10,14 +10,13 @@ from pathlib import Path
 
 import numpy as np
 
-from poro.assembly import deformation_gradient
-from poro.choice import finite_problem
-from poro.finite import deform
-from poro.flow import Flow
-from poro.laws import neo_hookean
-from poro.mesh.tetmesh import Array
-from poro.model import Theta, solve, without_wall
-from poro.tissue import Tissue
+from poro.arrays import Array
+from poro.collapse import Theta, solve
+from poro.collapse.choice import finite_problem
+from poro.collapse.finite_strain import deform
+from poro.collapse.model import without_wall
+from poro.fem import Flow, Tissue, neo_hookean
+from poro.fem.forms import deformation_gradient
 from vatsloc.study.poro_lung import HILUM_CENTRE, Lung, lung, smooth_wall, system_of
 from vatsloc.study.stability_poro_contact import contact_meshes, contact_methods
 from vatsloc.study.stability_poro_mesh import slivers, towards_incompressible
@@ -45,11 +44,11 @@ def pressure_bounds() -> list[Row]:
 
 def inverted_elements() -> list[Row]:
     """Smallest det F and inverted share over (kappa_b, phi) and the diaphragm's rise, linear against neo-Hookean."""
-    system, rows, law = system_of(lung(TETS), _TISSUE, smooth_wall()), [], neo_hookean(_TISSUE)
+    system, rows, material = system_of(lung(TETS), _TISSUE, smooth_wall()), [], neo_hookean(_TISSUE)
     phis = (0.3, 0.6, 0.9)
     values = [*product((1e-9, 1e-8, 1e-6), phis, (0.0,)), *product((1e-9,), phis, (40.0,))]
     for theta in (Theta(*value) for value in values):
-        linear, finite = solve(system, theta), deform(finite_problem(system, theta, law))
+        linear, finite = solve(system, theta), deform(finite_problem(system, theta, material))
         det = np.linalg.det(deformation_gradient(system.mesh, finite.u))
         total = system.mesh.volumes.sum()
         rows.append(

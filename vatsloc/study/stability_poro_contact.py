@@ -1,4 +1,4 @@
-"""Contact by active set beside penalty springs: how deep, how many steps, and what finer meshes change."""
+"""Contact by active set beside penalties: how deep, how many steps, and what finer meshes change."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 from scipy.sparse import bsr_matrix
 
+from poro.collapse import PoroState, PoroSystem, Theta, solve
+from poro.fem import Tissue, solid
+from poro.fem.tissue import GRAVITY_KPA_PER_MM
 from poro.mesh import interpolate, locate
-from poro.model import PoroState, PoroSystem, Theta, solve
-from poro.solid import solid
-from poro.tissue import GRAVITY_KPA_PER_MM, Tissue
 from vatsloc.study.poro_lung import lung, smooth_wall, system_of
 from vatsloc.study.tables import Row
 
@@ -84,8 +84,8 @@ def _pressed(system: PoroSystem, state: PoroState) -> Row:
 
 
 def _penalty(system: PoroSystem, theta: Theta, stiffness: float, most: int = 40) -> tuple[Any, int, float]:
-    """Displacements, iterations (`most` when it cycles) and smallest gap under springs of stiffness kPa/mm."""
-    mesh, nodes, obstacle = system.mesh, system.contact_nodes, system.obstacle
+    """Displacements, iterations (`most` when it cycles) and smallest gap under penalties of stiffness kPa/mm."""
+    mesh, nodes, wall = system.mesh, system.contact_nodes, system.wall
     p, _ = system.flow.pressure(theta.kappa_b)
     load = (system.pressure_load @ p).reshape(-1, 3)
     load = load + mesh.node_volumes[:, None] * system.gravity * GRAVITY_KPA_PER_MM * system.tissue.density(theta.phi)
@@ -95,19 +95,19 @@ def _penalty(system: PoroSystem, theta: Theta, stiffness: float, most: int = 40)
     steps = 0
     while steps < most:
         steps += 1
-        gap, gradient, hessian = obstacle.gap(u[nodes], theta.d_diaph_mm)
+        gap, gradient, hessian = wall.gap(u[nodes], theta.d_diaph_mm)
         pressing = np.where(gap < 0, stiffness * area[nodes], 0.0)
-        blocks, pull = np.zeros((len(u), 3, 3)), load.copy()
+        blocks, force = np.zeros((len(u), 3, 3)), load.copy()
         blocks[nodes] = pressing[:, None, None] * gradient[:, :, None] * gradient[:, None]
-        bend = (pressing * np.minimum(gap, 0))[:, None, None] * hessian
-        blocks[nodes] += bend
-        pull[nodes] += np.einsum("nij,nj->ni", bend, u[nodes])
+        geometric = (pressing * np.minimum(gap, 0))[:, None, None] * hessian
+        blocks[nodes] += geometric
+        force[nodes] += np.einsum("nij,nj->ni", geometric, u[nodes])
         along = np.einsum("nd,nd->n", gradient, u[nodes]) - gap
-        pull[nodes] += (pressing * along)[:, None] * gradient
-        springs = bsr_matrix((blocks, count, np.append(count, len(u)))).tocsr()
-        ahead = solid(mesh, system.tissue, system.hilum, springs).solve(pull, system.hilum_displacement)
+        force[nodes] += (pressing * along)[:, None] * gradient
+        penalty = bsr_matrix((blocks, count, np.append(count, len(u)))).tocsr()
+        ahead = solid(mesh, system.tissue, system.hilum, penalty).solve(force, system.hilum_displacement)
         moved = float(np.abs(ahead - u).max())
         u = u + min(1.0, 20 / max(moved, 1e-30)) * (ahead - u)
         if moved < 1e-3:
             break
-    return u, steps, float(obstacle.gap(u[nodes], theta.d_diaph_mm)[0].min())
+    return u, steps, float(wall.gap(u[nodes], theta.d_diaph_mm)[0].min())

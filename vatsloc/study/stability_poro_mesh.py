@@ -9,12 +9,14 @@ from scipy.optimize import bisect
 from scipy.sparse import csr_matrix
 from scipy.sparse.linalg import LinearOperator, eigsh
 
-from poro.assembly import body_load, consistent_mass, stiffness
-from poro.mesh.tetmesh import Array, TetMesh, dihedral_angles
-from poro.model import PoroSystem, Theta, solve
-from poro.solid import solid
-from poro.solver import Multigrid, linear_solver
-from poro.tissue import GRAVITY_KPA_PER_MM, Tissue
+from poro.arrays import Array
+from poro.collapse import PoroSystem, Theta, solve
+from poro.fem import Tissue, solid
+from poro.fem.forms import body_load, consistent_mass, stiffness
+from poro.fem.tissue import GRAVITY_KPA_PER_MM
+from poro.linalg import Multigrid, linear_solver
+from poro.mesh import TetMesh
+from poro.mesh.tetmesh import dihedral_angles
 from vatsloc.study.poro_lung import GRAVITY, Lung, lung, smooth_wall, system_of
 from vatsloc.study.tables import Row
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from poro.fit import CHI2_95_3D, ellipsoid95, point_covariance
+from poro.fit import ellipsoid95, point_covariance
+from poro.fit.covariance import CHI2_95_3D
 from poro.mesh import interpolate, locate
 from registration.verification import LeftOver
 from registration.volume import Array

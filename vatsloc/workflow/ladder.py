@@ -11,16 +11,20 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from poro.choice import Chosen, Range, keep_in_range
-from poro.choice import Model as Strain
-from poro.correct import correct, pull_of
-from poro.fit import Fit, FitSettings, FitStatus, fit
-from poro.laws import neo_hookean
+from poro.collapse import (
+    LinearRange,
+    PoroStatus,
+    PoroSystem,
+    assemble,
+    hilum_modes,
+    keep_in_range,
+    uniform_strain_modes,
+)
+from poro.collapse import StrainMeasure as Strain
+from poro.collapse.choice import StrainChoice
+from poro.fem import Tissue, neo_hookean
+from poro.fit import Fit, FitSettings, FitStatus, Target, constraints_to, elastic_correction, fit_collapse
 from poro.mesh import TetMesh, interpolate, locate
-from poro.model import PoroStatus, PoroSystem, assemble
-from poro.modes import hilum_modes, shape_modes
-from poro.observations import Target
-from poro.tissue import Tissue
 from registration.correspondences import Correspondences
 from registration.volume import Array
 from vatsloc.imaging.surface import Border, SurfacePoints
@@ -70,7 +74,7 @@ class Model:
     displacement: Array
     pairs: Correspondences
     rungs: tuple[Rung, ...]
-    solid: Chosen
+    solid: StrainChoice
     others: Array
 
     @property
@@ -91,10 +95,10 @@ def climb(gravity: Array, prepared: Prepared, observed: Observed, settings: Sett
         system = assemble(mesh, tissue, gravity, observed.hilum_nodes, observed.motion.displacement)
     surface = surface_target(observed.surface)
     with stages.stage("fit"):
-        plain = fit(system, surface, fit_settings(settings))
-        within = Range(share=settings.leave_out.strained_share)
+        plain = fit_collapse(system, surface, fit_settings(settings))
+        within = LinearRange(share=settings.leave_out.strained_share)
         solid = keep_in_range(system, plain.state, neo_hookean(tissue), within)
-    is_finite = solid.model is Strain.FINITE
+    is_finite = solid.strain is Strain.FINITE
     stages.choose(Choice(STRAIN, is_finite, solid.why, solid.share, within.share))
     start = Model(system, replace(plain, state=solid.state), solid.state.u, NO_PAIRS, (), solid, NO_OTHERS)
     model, blind = _rungs(start, surface, prepared, observed, settings, stages)
@@ -119,11 +123,12 @@ def _rungs(
         return model, model
     if settings.model.regional:
         with stages.stage("regional fit"):
-            steps = {"regional fit": _regional(model.system.gravity, settings)}
+            steps = {"regional fit": _regional(settings)}
             model, blind = best_of(steps, model, blind, surface)
     if settings.model.correct:
         with stages.stage("elastic correction"):
-            steps = {f"elastic correction, strain {strain:g}": corrected(strain) for strain in CORRECTION_STRAINS}
+            data = fit_settings(settings)
+            steps = {f"elastic correction, strain {strain:g}": corrected(strain, data) for strain in CORRECTION_STRAINS}
             model, blind = best_of(steps, model, blind, surface)
     return model, blind
 
@@ -148,7 +153,7 @@ def best_of(steps: dict[str, Step], model: Model, blind: Model, surface: Target)
 
 
 def _settled(model: Model) -> bool:
-    return model.fit.status is not FitStatus.CONTACT and model.fit.state.status is not PoroStatus.NOT_SETTLED
+    return model.fit.status is not FitStatus.CONTACT and model.fit.state.status is not PoroStatus.NOT_CONVERGED
 
 
 def _too_few(pairs: Correspondences) -> str | None:
@@ -196,31 +201,31 @@ def misfit(mesh: TetMesh, displacement: Array, pairs: Correspondences) -> float:
     return float(np.median(np.linalg.norm(moved - pairs.fixed, axis=1)))
 
 
-def _regional(gravity: Array, settings: Settings) -> Step:
+def _regional(settings: Settings) -> Step:
     """Smooth stretches of the resting shape, and the hilum's place, as further parameters of the fit."""
 
     def step(model: Model, target: Target, start: Fit) -> Model:
         mesh, tissue = model.system.mesh, model.system.tissue
-        modes = shape_modes(mesh, tissue, gravity, degree=0)
+        modes = uniform_strain_modes(mesh, tissue)
         modes += hilum_modes(mesh, model.system.hilum) if settings.model.hilum else ()
         system = replace(model.system, modes=modes)
         theta = start.theta
         chosen = replace(
             fit_settings(settings, len(modes)), starts=((theta.kappa_b, theta.phi, theta.d_diaph_mm, *theta.modes),)
         )
-        found = fit(system, target, chosen)
+        found = fit_collapse(system, target, chosen)
         return replace(model, system=system, fit=found, displacement=found.state.u)
 
     return step
 
 
-def corrected(strain: float) -> Step:
+def corrected(strain: float, settings: FitSettings) -> Step:
     """An elastic field on top; the model itself where that would turn more elements inside out."""
 
     def step(model: Model, target: Target, _start: Fit) -> Model:
         mesh = model.system.mesh
-        pull = pull_of(target, mesh, model.displacement)
-        found = correct(mesh, model.displacement, model.system.tissue, pull, strain)
+        wanted = constraints_to(target, mesh, model.displacement, settings)
+        found = elastic_correction(mesh, model.displacement, model.system.tissue, wanted, strain)
         inverted, before = ((det <= 0).mean() for det in (found.det_f, model.fit.state.det_f))
         if inverted > max(before, MOST_INVERTED):
             return model

@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from poro.collapse import PoroStatus
 from poro.fit import FitStatus, ellipsoid95
 from poro.mesh import closest_points
 from poro.mesh.tetmesh import signed_volumes
-from poro.model import PoroStatus
 from registration.images.resample import coarsen
 from registration.spine import RigidFit
 from registration.volume import Array, Mask
@@ -98,7 +98,7 @@ def conclude(
     case: Case, prepared: Prepared, pose: ChangeOfPose, collapse: Collapse, settings: Settings, stages: Stages
 ) -> Localization:
     """Where the nodule went, how sure that is, and which quality gates hold."""
-    if collapse.fit.state.status is PoroStatus.NOT_SETTLED or collapse.fit.status is FitStatus.CONTACT:
+    if collapse.fit.state.status is PoroStatus.NOT_CONVERGED or collapse.fit.status is FitStatus.CONTACT:
         raise NotConverged("The contact of the collapsing lung did not settle; try another mesh edge_mm.")
     nodule_inf = pose.inf_from_ct(case.nodule.centre_ras[None])[0]
     rigid = collapse.def_from_inf_rigid
@@ -202,7 +202,7 @@ def _note(pose: ChangeOfPose, collapse: Collapse, stages: Stages) -> None:
     unsettled = collapse.fit.status
     if unsettled is not FitStatus.CONVERGED:
         stages.warn(f"The fit ended early: {unsettled.value}.")
-    held = collapse.known.at_bound
+    held = collapse.identifiability.at_bound
     if held:
         stages.warn(f"The fit ended at a bound of {' and '.join(held)}: the model makes up there for what it lacks.")
     if np.any(collapse.fit.state.conflicts):

@@ -6,10 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from poro.fit import Fit
-from poro.identify import Identifiability, identifiability
+from poro.collapse import PoroSystem
+from poro.fit import Fit, Identifiability, identifiability
 from poro.mesh import TetMesh, TriSurface, interpolate, locate
-from poro.model import PoroSystem
 from registration.maps.rigid import RigidTransform
 from registration.volume import Array
 from vatsloc.case import Case
@@ -65,7 +64,7 @@ class Collapse:
         return self.model.fit
 
     @property
-    def known(self) -> Identifiability:
+    def identifiability(self) -> Identifiability:
         """What the observations tell of each parameter."""
         return identifiability(self.fit, self.system)
 

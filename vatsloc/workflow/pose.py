@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from poro.extrapolate import Extrapolation, extrapolate
+from poro.fem import Extrapolation, Tissue, extrapolate
 from poro.mesh import TetMesh, stuff
-from poro.tissue import Tissue
 from registration.ffd import FfdFit, FfdSettings, Weights
 from registration.images.resample import coarsen_mask
 from registration.maps.inversion import Inversion, invert_at

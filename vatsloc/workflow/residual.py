@@ -13,9 +13,8 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from poro.extrapolate import extrapolate
+from poro.fem import Tissue, extrapolate
 from poro.mesh import TetMesh
-from poro.tissue import Tissue
 from registration.correspondences import Correspondences
 from registration.ffd import FfdSettings, Weights, register_ffd
 from registration.images.morphology import dilate, erode

@@ -213,7 +213,7 @@ def _residuals(found: Localization) -> dict[str, Any]:
             "pressure_layer": collapse.system.flow.layer(collapse.fit.theta.kappa_b),
             "active_nodes": int(state.active.sum()),
             "min_det": state.det_f.min(),
-            "identifiability": collapse.known.entry(),
+            "identifiability": collapse.identifiability.entry(),
             "volume_ratio": collapse.mesh_after.volumes.sum() / collapse.mesh_before.volumes.sum(),
         },
         "keypoints": {"found": len(collapse.model.pairs), "held_back_mm": collapse.model.held_back_mm},

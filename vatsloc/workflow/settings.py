@@ -55,7 +55,8 @@ class ModelSettings(_Table):
 
 class KeypointSettings(_Table):
     """Places inside the lung, found again between the cone-beam CTs. Lengths in mm; reach_mm: how far off along each
-    axis the model may be; sigma_mm: standard deviation of one.
+    axis the model may be; sigma_mm: standard deviation of one in the fit, three quarters of it in the elastic
+    correction.
     """
 
     on: bool = True

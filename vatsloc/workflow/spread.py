@@ -7,9 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from poro.fit import Fit, FitSettings, fit
-from poro.model import PoroStatus, PoroSystem
-from poro.observations import Target
+from poro.collapse import PoroStatus, PoroSystem
+from poro.fit import Fit, FitSettings, Target, fit_collapse
 from registration.maps.rigid import RigidTransform
 from registration.volume import Array
 
@@ -28,10 +27,10 @@ def other_answers(system: PoroSystem, surface: Target, best: Fit, settings: FitS
     """
     theta = best.theta
     again = replace(settings, starts=((theta.kappa_b, theta.phi, theta.d_diaph_mm),))
-    found = [fit(system, surface, replace(settings, starts=(start,))) for start in STARTS]
+    found = [fit_collapse(system, surface, replace(settings, starts=(start,))) for start in STARTS]
     found = [other for other in found if other.costs[0] <= AS_GOOD * best.costs.min()]
-    found += [fit(other, target, again) for other, target in _disturbed(system, surface)]
-    settled = [other.state.u - best.state.u for other in found if other.state.status is not PoroStatus.NOT_SETTLED]
+    found += [fit_collapse(other, target, again) for other, target in _disturbed(system, surface)]
+    settled = [other.state.u - best.state.u for other in found if other.state.status is not PoroStatus.NOT_CONVERGED]
     return np.array(settled).reshape(-1, *best.state.u.shape)
 
 

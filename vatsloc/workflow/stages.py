@@ -10,7 +10,10 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from vatsloc.errors import InputRefused
+import numpy as np
+
+from poro.errors import SolverError
+from vatsloc.errors import InputRefused, NotConverged
 from vatsloc.workflow.choices import Choice
 
 Say = Callable[[str], None]
@@ -39,13 +42,16 @@ class Stages:
     def stage(self, name: str) -> Iterator[None]:
         """Time a block as the stage `name` and note the highest memory while it ran.
 
-        Numerics refuse what they cannot work with by a ValueError; it leaves as InputRefused that names the stage.
+        Numerics refuse what they cannot work with by a ValueError; it leaves as InputRefused that names the stage. A
+        linear solver without an answer raises SolverError, numpy's LinAlgError; they leave as NotConverged.
         """
         self.say(f"{name} ...")
         reset = _reset_peak()
         start, start_cpu = time.perf_counter(), time.process_time()
         try:
             yield
+        except (SolverError, np.linalg.LinAlgError) as error:  # the latter is a ValueError too
+            raise NotConverged(f"The stage '{name}' has no answer: {error}; try another [mesh] edge_mm.") from error
         except ValueError as error:
             raise InputRefused(f"The stage '{name}' cannot work with these images: {error}.") from error
         self.seconds[name] = round(time.perf_counter() - start, 3)

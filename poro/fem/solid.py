@@ -1,0 +1,67 @@
+"""Linear elastic lung with imposed displacements. Ref: Alvarez 2021, eq. 10."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import csr_matrix
+
+from poro.arrays import Array
+from poro.fem.forms import stiffness
+from poro.fem.tissue import Tissue
+from poro.linalg.solver import LinearSolver, linear_solver
+from poro.mesh.tetmesh import TetMesh
+
+
+@dataclass(frozen=True)
+class Solid:
+    """Factorized stiffness of a mesh held at nodes `fixed`; free_unknowns: rows of the unknowns that remain."""
+
+    mesh: TetMesh
+    fixed: Array
+    free_unknowns: Array
+    solver: LinearSolver
+    coupling: csr_matrix
+
+    def solve(self, force: Array, imposed: Array | None = None) -> Array:
+        """Displacements (n, 3) or (n, 3, k) mm under nodal forces of that shape, with imposed displacements at `fixed`.
+
+        force: kPa mm2; imposed: (nfixed, 3) or (nfixed, 3, k) mm, zero when left out.
+        """
+        shape = force.shape
+        right = force.reshape(3 * shape[0], *shape[2:])[self.free_unknowns]
+        u = np.zeros((3 * shape[0], *shape[2:]))
+        if imposed is not None:
+            held = imposed.reshape(3 * len(self.fixed), *shape[2:])
+            right = right - self.coupling @ held
+            u[unknowns_of(self.fixed)] = held
+        u[self.free_unknowns] = self.solver.solve(right)
+        return u.reshape(shape)
+
+
+def unknowns_of(nodes: Array) -> Array:
+    """Rows 3 * node + axis of nodes (k,), (3k,)."""
+    return (np.asarray(nodes)[:, None] * 3 + np.arange(3)).ravel()
+
+
+def _centred(points: Array) -> Array:
+    return points - points.mean(axis=0) if len(points) else np.zeros((1, 3))
+
+
+def solid(mesh: TetMesh, tissue: Tissue, fixed: Array, constraints: csr_matrix | None = None) -> Solid:
+    """Factorize the elastic stiffness, plus that of optional point constraints (3n, 3n) kPa mm, with `fixed` held.
+
+    Raises ValueError when neither fixed nodes nor constraints hold the body, SolverError when they do not suffice.
+    """
+    if constraints is None and np.linalg.matrix_rank(_centred(mesh.points[fixed]), tol=1e-6) < 2:
+        raise ValueError(f"{len(np.unique(fixed))} held nodes let the body move freely; hold three that span a plane")
+    matrix = stiffness(mesh, tissue.lame_kpa, tissue.shear_kpa)
+    if constraints is not None:
+        matrix = (matrix + constraints).tocsr()
+    fixed = np.unique(fixed).astype(np.int64)
+    free = np.setdiff1d(np.arange(len(mesh.points)), fixed)
+    rows = unknowns_of(free)
+    reduced = matrix[rows]
+    solver = linear_solver(reduced[:, rows].tocsr(), mesh.points[free])
+    return Solid(mesh, fixed, rows, solver, reduced[:, unknowns_of(fixed)].tocsr())

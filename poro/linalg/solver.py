@@ -1,0 +1,119 @@
+"""One linear solver for elasticity and flow: dense-front Cholesky, or smoothed aggregation when the factor is too
+large.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+import pyamg
+from scipy.sparse import bsr_matrix, csr_matrix
+
+from poro.arrays import Array
+from poro.errors import SolverError
+from poro.linalg.cholesky import Cholesky, cholesky
+from poro.linalg.dissection import Tree, dissect
+
+# Numbers in a factor above which memory (8 bytes each) decides for the iterative solver.
+FACTOR_LIMIT = 150_000_000
+MAX_ITERATIONS = 200  # of multigrid
+
+
+class LinearSolver(Protocol):
+    """Anything that solves for one (n,) or many (n, k) right-hand sides."""
+
+    def solve(self, right: Array) -> Array:
+        """Solution of the shape of `right`."""
+        ...
+
+
+@dataclass(frozen=True)
+class Multigrid:
+    """Conjugate gradients preconditioned by smoothed aggregation; stops at a relative residual of `tolerance`.
+
+    residuals: norms of the last right-hand side's iterations, the first before any.
+    """
+
+    matrix: bsr_matrix
+    hierarchy: Any
+    tolerance: float = 1e-10
+    residuals: list[float] = field(default_factory=list)
+
+    def solve(self, right: Array) -> Array:
+        """Solution of the shape of `right`; raises SolverError when MAX_ITERATIONS do not suffice."""
+        columns = [self._solve_one(b) for b in np.atleast_2d(right.T)]
+        return columns[0] if right.ndim == 1 else np.stack(columns, axis=1)
+
+    def _solve_one(self, right: Array) -> Array:
+        if not right.any():
+            return np.zeros_like(right)
+        self.residuals.clear()
+        x, info = self.hierarchy.solve(
+            right, tol=self.tolerance, accel="cg", maxiter=MAX_ITERATIONS, residuals=self.residuals, return_info=True
+        )
+        if info:
+            relative = tuple(float(r / self.residuals[0]) for r in self.residuals)
+            raise SolverError(
+                f"multigrid stopped at a relative residual of {relative[-1]:.1e} after {MAX_ITERATIONS} iterations",
+                relative,
+            )
+        return x
+
+
+def rigid_body_modes(points: Array) -> Array:
+    """Three translations and three rotations at points (n, 3), as columns (3n, 6)."""
+    modes = np.zeros((len(points), 3, 6))
+    modes[:, :, :3] = np.eye(3)
+    centred = points - points.mean(axis=0)
+    for axis in range(3):
+        modes[:, :, 3 + axis] = np.cross(np.eye(3)[axis], centred)
+    return modes.reshape(-1, 6)
+
+
+def elimination_tree(matrix: csr_matrix, points: Array) -> Tree:
+    """Order in which a matrix with 1 or 3 unknowns at each of points (n, 3) is eliminated."""
+    block = matrix.shape[0] // len(points)
+    return dissect(_node_graph(matrix, block), points, 96 if block == 1 else 40)
+
+
+def linear_solver(
+    matrix: csr_matrix, points: Array, tree: Tree | None = None, limit: int = FACTOR_LIMIT
+) -> LinearSolver:
+    """Solver of a symmetric positive definite matrix with 1 or 3 unknowns at each of points (n, 3); chosen by size.
+
+    tree: of an earlier matrix with the same entries, to save its making.
+    """
+    block = matrix.shape[0] // len(points)
+    tree = tree or elimination_tree(matrix, points)
+    if tree.factor_entries(block) <= limit:
+        return cholesky(matrix, tree, block)
+    near_null = rigid_body_modes(points) if block == 3 else np.ones((len(points), 1))
+    blocked = bsr_matrix(matrix, blocksize=(block, block))
+    hierarchy = pyamg.smoothed_aggregation_solver(
+        blocked, B=near_null, strength=("symmetric", {"theta": 0.0}), max_coarse=300
+    )
+    return Multigrid(blocked, hierarchy)
+
+
+def inverse_at(solver: LinearSolver, unknowns: Array, size: int, dtype: type, batch: int = 384) -> Array:
+    """Rows and columns (k, k) of type `dtype` of the inverse of a matrix of `size` unknowns at distinct ones (k,)."""
+    if isinstance(solver, Cholesky):
+        return solver.inverse_at(unknowns, dtype)
+    result: Array = np.empty((len(unknowns), len(unknowns)), dtype)
+    for first in range(0, len(unknowns), batch):
+        chunk = unknowns[first : first + batch]
+        right = np.zeros((size, len(chunk)))
+        right[chunk, np.arange(len(chunk))] = 1
+        result[:, first : first + batch] = solver.solve(right)[unknowns]
+    return result
+
+
+def _node_graph(matrix: csr_matrix, block: int) -> csr_matrix:
+    """Which nodes share an entry."""
+    if block == 1:
+        return matrix
+    pairs = bsr_matrix(matrix, blocksize=(block, block))
+    n = matrix.shape[0] // block
+    return csr_matrix((np.ones(len(pairs.indices)), pairs.indices, pairs.indptr), shape=(n, n))
