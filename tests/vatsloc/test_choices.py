@@ -17,7 +17,7 @@ from vatsloc.phantom_case import write_phantom
 from vatsloc.study.choices import LIMITS, Tried, table, try_choices
 from vatsloc.workflow.choices import Choice, weigh
 from vatsloc.workflow.pneumothorax import RESIDUAL
-from vatsloc.workflow.pose import FIRST, extrapolated, moved_far
+from vatsloc.workflow.pose import FIRST, moved_far
 from vatsloc.workflow.stages import Stages
 
 SMALL = PhantomSpec("small", "right", ct_spacing=(2.0, 2.0, 2.0), cbct_spacing=(2.0, 2.0, 2.0), element=22.0)
@@ -76,13 +76,6 @@ def test_places_that_moved_little_against_the_spine_make_the_first_registration_
     none = sliding_fit(0, moved_mm(None, spine))
     assert moved_far(none, 100.0).kept
     assert moved_far(none, 100.0).value == inf
-
-
-def test_extrapolation_goes_where_no_node_is_out_of_view() -> None:
-    seen = np.arange(1000) >= 10
-    assert extrapolated(seen).kept
-    assert extrapolated(seen).why == "1.0 % of the lung's nodes are out of view; left out up to 0 %"
-    assert not extrapolated(seen | True).kept
 
 
 @pytest.fixture(scope="module")

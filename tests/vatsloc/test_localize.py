@@ -73,7 +73,7 @@ def test_every_output_is_there(result: Path) -> None:
 def test_run_holds_the_agreed_keys(run: dict[str, Any]) -> None:
     agreed = {"status", "nodule_lps", "nodule_ellipsoid95_mm", "theta", "seconds", "peak_mb", "skipped", "gates"}
     assert agreed | {"warnings"} <= set(run)
-    parts = ["first registration", "extrapolation", "finite strain", "residual registration"]
+    parts = ["first registration", "finite strain", "residual registration"]
     assert [choice["part"] for choice in run["choices"]] == parts
     assert {choice["part"] for choice in run["choices"] if not choice["kept"]} <= set(run["skipped"])
     assert set(run["theta"]) == {"kappa_b", "phi", "d_diaph_mm"}

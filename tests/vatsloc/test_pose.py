@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from poro.mesh import TetMesh, closest_points
+from poro.mesh.tetmesh import signed_volumes
 from registration.correspondences import Correspondences
 from registration.maps.inversion import Inversion, invert_at
 from registration.sliding import moved_mm
@@ -17,14 +19,14 @@ from tests.vatsloc import ball_scene as scene
 from vatsloc.errors import InputRefused
 from vatsloc.workflow import pose as module
 from vatsloc.workflow.pose import (
-    EXTRAPOLATION,
     FIRST,
     ChangeOfPose,
     _deep_inside,
     _hinted,
+    _laid_out,
     as_side,
     change_of_pose,
-    extrapolated,
+    continued,
     ffd_settings,
     moved_far,
 )
@@ -175,15 +177,18 @@ def test_what_is_seen_outweighs_what_is_not_and_what_did_not_settle_is_left_out(
     found = watched.run()
     points = found.mesh_ct.points
     assert (moved(points)[asked["unsettled"], 0] < PLANE - 10.0).any()  # some of them well in view
-    assert_allclose(asked["mesh"].points, scene.INF_FROM_CT(points), atol=1e-9)
     assert_array_equal(asked["nodes"], np.flatnonzero(~asked["unsettled"]))
     assert not found.seen[asked["unsettled"]].any()
-    wanted = (moved(points) - scene.INF_FROM_CT(points))[asked["nodes"]]
+    wanted = (moved(points) - asked["mesh"].points)[asked["nodes"]]
     assert_allclose(asked["displacement"], wanted, atol=0.02)
-    assert_array_equal(asked["weights"], np.where(found.seen[asked["nodes"]], 100.0, 1.0))
+    depth = -closest_points(found.mesh_ct.boundary, points).distance[asked["nodes"]]
+    told, seen = 0.01 * 1e4 ** np.clip((depth - 4) / 12, 0, 1), found.seen[asked["nodes"]]
+    assert_allclose(asked["weights"], np.where(seen, told, np.minimum(told, 1.0)))
+    assert asked["weights"][seen & (depth >= 16)].min() == pytest.approx(100.0)
+    assert asked["weights"][depth <= 4].max() == pytest.approx(0.01)
 
 
-def test_with_all_of_the_lung_in_view_nothing_is_continued(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_with_all_of_the_lung_in_view_every_node_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
     watched = Watched(monkeypatch, half=False)
     wide = scene.grid_about(scene.CENTRE_INF, 40, 4.0)
     seen = Mask(np.ones(wide.shape, bool), wide.ras_from_ijk)
@@ -199,11 +204,8 @@ def test_with_all_of_the_lung_in_view_nothing_is_continued(monkeypatch: pytest.M
     found = watched.run()
     assert found.seen.all()
     assert found.overlap == 1.0
-    assert found.extrapolation is None
-    assert EXTRAPOLATION in watched.stages.skipped
-    assert found.inversion is not None
-    assert_array_equal(found.points_inf, found.inversion.points_fixed)
-    assert_allclose(found.points_inf, moved(found.mesh_ct.points), atol=0.02)
+    assert found.extrapolation is not None
+    assert np.linalg.norm(found.points_inf - moved(found.mesh_ct.points), axis=1).mean() < 0.1
 
 
 def test_a_registration_that_is_switched_off_leaves_the_lung_to_the_spine(watched: Watched) -> None:
@@ -267,17 +269,7 @@ def test_without_matches_the_start_is_taken_to_be_far() -> None:
 def test_a_registration_without_coarse_levels_of_its_own_leaves_no_choice(watched: Watched) -> None:
     watched.fit = SimpleNamespace(moving_from_fixed=moved_back)
     watched.run()
-    assert [choice.part for choice in watched.stages.choices] == [EXTRAPOLATION]
-
-
-def test_motion_is_continued_where_a_node_is_out_of_view() -> None:
-    seen = np.ones(200, bool)
-    assert not extrapolated(seen).kept
-    seen[17] = False
-    choice = extrapolated(seen)
-    assert choice.kept
-    assert (choice.part, choice.value) == (EXTRAPOLATION, 0.005)
-    assert choice.why.startswith("0.5 % of the lung's nodes are out of view")
+    assert watched.stages.choices == []
 
 
 def test_deep_inside_keeps_off_the_rim_and_the_end_of_the_image() -> None:
@@ -303,3 +295,53 @@ def test_settings_of_a_run_reach_the_registration() -> None:
 
 def test_sides_keep_their_names() -> None:
     assert (as_side("left"), as_side("right")) == ("left", "right")
+
+
+PULLED = np.array([[1.1, 0.2, 0.0], [-0.1, 0.8, 0.3], [0.0, 0.1, 0.95]])
+
+
+def quadratic(x: Array) -> Array:
+    """A large affine motion that bends a little."""
+    y = x - scene.CENTRE_INF
+    return np.asarray(y @ PULLED.T + 0.002 * y[:, [1]] ** 2 * np.array([0, 0, 1.0]) + scene.CENTRE_INF)
+
+
+def ball() -> tuple[TetMesh, TetMesh, Array]:
+    """The lung in the CT, placed by the spine, and its nodes' depths."""
+    mesh = scene.lung_mesh()
+    depth = -closest_points(mesh.boundary, mesh.points).distance
+    return mesh, TetMesh(scene.INF_FROM_CT(mesh.points), mesh.tets), depth
+
+
+def test_a_wrong_motion_at_the_pleura_is_not_believed_and_a_large_one_inside_goes_on_to_it() -> None:
+    mesh, placed, depth = ball()
+    truth = quadratic(placed.points)
+    points = truth + np.where(depth < 6, 8.0, 0.0)[:, None] * np.array([1.0, 0, 0])  # slid along with the wall
+    everywhere = np.ones(len(points), bool)
+    found = continued(mesh, placed, points, everywhere, everywhere)
+    error = np.linalg.norm(placed.points + found.u - truth, axis=1)
+    assert error[depth >= 16].max() < 0.3
+    assert error[depth < 6].mean() < 2.0  # of 8
+    assert_allclose(found.det_f, signed_volumes(placed.points + found.u, mesh.tets) / placed.volumes)
+    assert found.det_f.min() > 0.5
+
+
+@pytest.mark.parametrize("bend", [0.0, 0.2])
+def test_the_lung_is_laid_out_by_a_map_that_keeps_its_shape(bend: float) -> None:
+    """A bend of 0.2 per mm turns elements inside out, so the affine map has to do."""
+    _, placed, depth = ball()
+    y = placed.points - scene.CENTRE_INF
+    points = quadratic(placed.points) + bend * y[:, [1]] ** 2 * np.array([0, 1.0, 0])
+    laid_out = _laid_out(placed, points, depth > 10)
+    if bend:
+        kept = signed_volumes(laid_out, placed.tets) / placed.volumes
+        assert_allclose(kept, kept[0])  # affine
+        assert kept[0] > 0.3
+    else:
+        assert_allclose(laid_out, points, atol=1e-6)
+
+
+def test_a_lung_of_which_little_is_believed_stays_where_the_spine_puts_it() -> None:
+    _, placed, _ = ball()
+    few = np.arange(len(placed.points)) < 15
+    assert _laid_out(placed, quadratic(placed.points), few) is placed.points

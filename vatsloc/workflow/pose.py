@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import ndimage
 
 from poro.fem import Extrapolation, Tissue, extrapolate
-from poro.mesh import TetMesh, stuff
+from poro.mesh import TetMesh, closest_points, stuff
+from poro.mesh.tetmesh import signed_volumes
 from registration.ffd import FfdFit, FfdSettings, Weights
 from registration.images.resample import coarsen_mask
 from registration.maps.inversion import Inversion, invert_at
@@ -31,10 +32,16 @@ RIM_MM = 4.0
 SEEN, UNSEEN = 100.0, 1.0
 """Weights of the registration at nodes that the scanner saw, and of its smooth continuation at the others. Elastic
 tissue that nothing holds there falls back towards the spine's pose: it was 3 to 12 mm off, and is 2 to 4 continued."""
+SHALLOW, SHALLOW_MM, DEEP_MM = 0.01, 4.0, 16.0
+"""Weight of the registration at seen nodes up to a depth below the pleura, and from which depth on it counts in full.
+Near the wall no texture told it anything, and a spline runs on straight while the tissue slides."""
+POLYNOMIAL_MM = 50.0
+LEAST_STRETCH = 0.3
+"""Smallest det of the gradient of a polynomial map that the lung may be laid out by."""
 HINT_REACH_MM = 10.0
 """How far a marked vertebra may be off: less than half the distance to the next one."""
-FIRST, EXTRAPOLATION = "first registration", "extrapolation"
-"""Parts that the scene has a say in; the first is the coarse levels, led by places found far off the spine's pose."""
+FIRST = "first registration"
+"""A part that the scene has a say in: the coarse levels, led by keypoints matched far off the spine's pose."""
 Register = Callable[..., FfdFit]
 """A registration that is called as `register_sliding` is."""
 
@@ -43,8 +50,8 @@ Register = Callable[..., FfdFit]
 class ChangeOfPose:
     """The lung before its collapse. mesh_ct, points_inf: the same nodes in the CT and in the inflated CBCT, mm.
 
-    ffd, its inversion at the nodes: None where the lung was left to the spine alone; extrapolation: None there too, and
-    where it was left out; seen: (n,) nodes that the scanner saw; lung_inf: lung mask in the CBCT; overlap: share of the
+    ffd, its inversion at the nodes: None where the lung was left to the spine alone; extrapolation: None there too;
+    seen: (n,) nodes that the scanner saw; lung_inf: lung mask in the CBCT; overlap: share of the
     lung in its field of view.
     """
 
@@ -120,18 +127,13 @@ def change_of_pose(
         inversion = invert_at(ffd.moving_from_fixed, mesh.points, placed.points)
         settled = inversion.residual_mm < settings.gates.max_inversion_mm
         seen = _deep_inside(prepared.inflated.field.usable, inversion.points_fixed) & settled
-        points, extension = inversion.points_fixed, None
-        if stages.choose(extrapolated(seen)):
-            nodes = np.flatnonzero(settled)
-            weights = np.where(seen[nodes], SEEN, UNSEEN)
-            extension = extrapolate(placed, nodes, (points - placed.points)[nodes], Tissue(), weights)
-            points = placed.points + extension.u
+        extension = continued(mesh, placed, inversion.points_fixed, seen, settled)
     return ChangeOfPose(
         rigid=rigid,
         ffd=ffd,
         lung_inf=lung_inf,
         mesh_ct=mesh,
-        points_inf=points,
+        points_inf=placed.points + extension.u,
         seen=seen,
         inversion=inversion,
         extrapolation=extension,
@@ -147,10 +149,45 @@ def moved_far(fit: SlidingFit, limit_mm: float) -> Choice:
     return weigh(FIRST, moved, limit_mm, seen)
 
 
-def extrapolated(seen: Array) -> Choice:
-    """Whether the motion has to be continued to what the scanner does not see, of nodes seen (n,) bool."""
-    share = np.count_nonzero(~seen) / len(seen)
-    return weigh(EXTRAPOLATION, share, 0.0, f"{100 * share:.1f} % of the lung's nodes are out of view", "%")
+def continued(mesh: TetMesh, placed: TetMesh, points: Array, seen: Array, settled: Array) -> Extrapolation:
+    """The registration's motion, believed where the images told it and continued elastically elsewhere.
+
+    mesh, placed: the lung in the CT, and there placed by the spine; points: (n, 3) where the registration puts the
+    nodes; seen, settled: (n,) bool, in view; inverted. The elastic lung is first laid out by the best quadratic map of
+    the nodes that are believed in full, since linear elasticity loses large rotations and strains.
+    """
+    depth = -closest_points(mesh.boundary, mesh.points).distance
+    deep = np.clip((depth - SHALLOW_MM) / (DEEP_MM - SHALLOW_MM), 0, 1)
+    told = SHALLOW * (SEEN / SHALLOW) ** deep
+    weights = np.where(seen, told, np.minimum(told, UNSEEN))
+    laid_out = TetMesh(_laid_out(placed, points, seen & (depth > (SHALLOW_MM + DEEP_MM) / 2)), mesh.tets)
+    nodes = np.flatnonzero(settled)
+    found = extrapolate(laid_out, nodes, (points - laid_out.points)[nodes], Tissue(), weights[nodes])
+    u = laid_out.points + found.u - placed.points
+    return replace(found, u=u, det_f=signed_volumes(placed.points + u, mesh.tets) / placed.volumes)
+
+
+def _laid_out(placed: TetMesh, points: Array, believed: Array) -> Array:
+    """Nodes (n, 3) under the best quadratic map of the believed ones, or the best affine one, or none: the first that
+    keeps every element's shape.
+    """
+    centre = placed.points.mean(axis=0)
+    for degree in (2, 1):
+        terms = _monomials((placed.points - centre) / POLYNOMIAL_MM, degree)
+        if believed.sum() < 4 * terms.shape[1]:
+            continue
+        laid_out = terms @ np.linalg.lstsq(terms[believed], points[believed], rcond=None)[0]
+        if (signed_volumes(laid_out, placed.tets) > LEAST_STRETCH * placed.volumes).all():
+            return np.asarray(laid_out)
+    return placed.points
+
+
+def _monomials(x: Array, degree: int) -> Array:
+    """1, the coordinates and, for degree 2, their products, (n, 4) or (n, 10)."""
+    terms = [np.ones(len(x)), *x.T]
+    if degree == 2:
+        terms += [x[:, a] * x[:, b] for a in range(3) for b in range(a, 3)]
+    return np.stack(terms, axis=1)
 
 
 def ffd_settings(settings: RegistrationSettings) -> FfdSettings:
