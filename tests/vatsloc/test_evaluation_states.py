@@ -18,7 +18,7 @@ from registration.volume import Array, Grid, Mask
 from tests.vatsloc import run_scene as known
 from vatsloc.case import Landmarks
 from vatsloc.evaluation.evaluate import Evaluation, as_csv, evaluate
-from vatsloc.evaluation.inputs import Result, Truth
+from vatsloc.evaluation.inputs import Result, Truth, depth_below_pleura
 from vatsloc.evaluation.landmarks import LandmarkTriples
 from vatsloc.evaluation.statistics import signed_rank_p
 from vatsloc.evaluation.table import table
@@ -253,6 +253,7 @@ def test_dense_tissue_is_scored_in_and_out_of_view(result: Result) -> None:
     got = {
         (where, measure): (s["mean"], s["max"], s["n"])
         for where, measures in summary["dense"].items()
+        if where != "by_depth"
         for measure, s in measures.items()
     }
     assert got == {
@@ -265,6 +266,36 @@ def test_dense_tissue_is_scored_in_and_out_of_view(result: Result) -> None:
     assert (held["inside_fov"]["share"], held["inside_fov"]["n"]) == (0.5, 2)
     assert held["inside_fov"]["median_mm"] == pytest.approx(7 + 0.1 * 5.5)
     assert held["outside_fov"]["median_mm"] == pytest.approx(7 + 0.1 * 28.0)
+
+
+def test_dense_tissue_in_view_is_scored_by_depth_below_the_pleura(result: Result) -> None:
+    lung = result.lung_ct
+    centre = lung.boundary.points.mean(axis=0)
+    ct = centre + np.array([[0.0, 0, 0], [0.1, 0, 0], [0, 0, 0.2], [500.0, 0, 0]])  # the last one far outside
+    depth = depth_below_pleura(lung, ct)
+    inflated, deflated = ct + INFLATED_AT + np.array([0, 1.0, 0]), ct + DEFLATED_AT
+    everywhere = Mask(np.ones((2, 2, 2), bool), np.diag([2000.0, 2000, 2000, 1]) - np.array([[0, 0, 0, 1000.0]] * 4))
+    known = replace(
+        truth(),
+        dense=np.stack([ct, inflated, deflated], axis=1),
+        fields_of_view={"inflated": everywhere, "deflated": everywhere},
+    )
+    classes = evaluate(known, result).summary["dense"]["by_depth"]
+    assert [(told["from_mm"], told["to_mm"]) for told in classes] == [(0, 5), (5, 10), (10, 20), (20, 30), (30, None)]
+    bounds = [(-np.inf, 5), (5, 10), (10, 20), (20, 30), (30, np.inf)]
+    counts = [int(((depth >= a) & (depth < b)).sum()) for a, b in bounds]
+    assert [told["n"] for told in classes] == counts
+    assert counts[0] >= 1
+    assert sum(counts) == 4
+    errors = np.linalg.norm(result.maps.inf_from_ct(ct) - inflated, axis=1)
+    for told, (a, b) in zip(classes, bounds, strict=True):
+        at = (depth >= a) & (depth < b)
+        if not at.any():
+            assert (told["phase1"], told["chain"], told["share_in_radius95"]) == (None, None, None)
+            continue
+        assert told["phase1"]["mean"] == pytest.approx(errors[at].mean())
+        assert told["phase1"]["max"] == pytest.approx(errors[at].max())
+        assert told["phase1"] != told["chain"]
 
 
 def test_csv_has_each_value_in_its_own_column(scores: Evaluation) -> None:

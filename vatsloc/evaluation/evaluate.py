@@ -7,6 +7,7 @@ import io
 import json
 import math
 from dataclasses import asdict, dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,9 @@ from vatsloc.frames import flip_points
 from vatsloc.report.data import TreSection
 from vatsloc.report.render import with_scores
 from vatsloc.results import REPORT
+
+DENSE_DEPTHS_MM = (0.0, 5.0, 10.0, 20.0, 30.0, math.inf)
+"""Bounds of the classes of depth below the pleura that tissue errors are told by; points outside count as the first."""
 
 
 @dataclass(frozen=True)
@@ -135,7 +139,7 @@ def as_csv(scores: Evaluation) -> str:
 
 def _dense(points: Array, truth: Truth, result: Result) -> tuple[dict[str, Any], dict[str, Any]]:
     """Errors at tissue points all over the lung, and how many of them are within their radius, apart for those that
-    both cone-beam CTs show and the others.
+    both cone-beam CTs show and the others; of the former also by depth below the pleura.
     """
     ct, inflated, deflated = points[:, 0], points[:, 1], points[:, 2]
     seen = seen_in(truth.fields_of_view["inflated"], inflated) & seen_in(truth.fields_of_view["deflated"], deflated)
@@ -144,9 +148,27 @@ def _dense(points: Array, truth: Truth, result: Result) -> tuple[dict[str, Any],
         "chain": distances(result.maps.def_from_ct(ct), deflated),
     }
     radius = _radius95(result, ct)
-    places = {"inside_fov": seen, "outside_fov": ~seen}
-    scores = {where: {m: asdict(summarize(e[at])) for m, e in errors.items()} for where, at in places.items()}
-    return scores, {where: _held(errors["chain"][at], radius[at]) for where, at in places.items()}
+    parts = {"inside_fov": seen, "outside_fov": ~seen}
+    scores: dict[str, Any] = {
+        where: {m: asdict(summarize(e[at])) for m, e in errors.items()} for where, at in parts.items()
+    }
+    depth = depth_below_pleura(result.lung_ct, ct)
+    scores["by_depth"] = _dense_by_depth({m: e[seen] for m, e in errors.items()}, depth[seen], radius[seen])
+    return scores, {where: _held(errors["chain"][at], radius[at]) for where, at in parts.items()}
+
+
+def _dense_by_depth(errors: dict[str, Array], depth_mm: Array, radius_mm: Array) -> list[dict[str, Any]]:
+    """Classes of depth below the pleura: n, mean, 95 % and maximum of each error (n,) mm, share within the radius."""
+    classes = []
+    for low, high in pairwise(DENSE_DEPTHS_MM):
+        at = (depth_mm < high) & (depth_mm >= (low if low > 0 else -np.inf))
+        told: dict[str, Any] = {"from_mm": low, "to_mm": None if math.isinf(high) else high, "n": int(at.sum())}
+        for measure, mm in errors.items():
+            s = summarize(mm[at])
+            told[measure] = {"mean": s.mean, "p95": s.p95, "max": s.max} if s.n else None
+        told["share_in_radius95"] = _held(errors["chain"][at], radius_mm[at])["share"]
+        classes.append(told)
+    return classes
 
 
 def _radius95(result: Result, points_ct: Array) -> Array:

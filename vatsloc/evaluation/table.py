@@ -19,7 +19,9 @@ def table(summary: Mapping[str, Any]) -> str:
         numbers = "".join(f"{_mm(s[c]):>8}" for c in _COLUMNS)
         p = summary["wilcoxon_p"].get(measure) if measure in BEFORE else None
         lines.append(f"{measure:<26}{numbers}{s['n']:>6}" + ("" if p is None else f"  {p:.2g}"))
-    for where, errors in (summary.get("dense") or {}).items():
+    dense = dict(summary.get("dense") or {})
+    classes = dense.pop("by_depth", [])
+    for where, errors in dense.items():
         for measure, s in errors.items():
             numbers = "".join(f"{_mm(s[c]):>8}" for c in _COLUMNS)
             lines.append(f"{f'{measure}, {_WHERE[where]}':<26}{numbers}{s['n']:>6}")
@@ -29,12 +31,22 @@ def table(summary: Mapping[str, Any]) -> str:
         for where, held in summary["in_radius95"].items()
         if held["n"]
     ]
+    lines += [_class_line(told) for told in classes if told["n"]]
     inside = {True: ", inside its 95 % ellipsoid", False: ", outside its 95 % ellipsoid", None: ""}
     lines.append(
         f"nodule: {_mm(summary['nodule_inflated_mm'])} mm off in the inflated CBCT, "
         f"{_mm(summary['nodule_deflated_mm'])} mm in the deflated one{inside[summary['nodule_in_ellipsoid95']]}"
     )
     return "\n".join([*lines, *(f"note: {warning}" for warning in summary["warnings"])])
+
+
+def _class_line(told: Mapping[str, Any]) -> str:
+    """One class of depth below the pleura."""
+    to = "deeper" if told["to_mm"] is None else f"{told['to_mm']:.0f} mm"
+    phase1, chain = (f"{_mm(told[m]['mean'])} / {_mm(told[m]['p95'])}" for m in ("phase1", "chain"))
+    share = told["share_in_radius95"]
+    held = "" if share is None else f", {share:.1%} within their 95 % radius"
+    return f"tissue seen, {told['from_mm']:.0f} mm to {to}: mean / 95 % phase 1 {phase1}, chain {chain}{held}"
 
 
 def _mm(value: float | None) -> str:
