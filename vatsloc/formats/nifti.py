@@ -15,6 +15,7 @@ from typing import IO, cast
 
 import nibabel
 import numpy as np
+from nibabel.arrayproxy import ArrayProxy
 
 from registration.volume import Array, Mask, Volume
 from vatsloc.errors import InputRefused
@@ -95,7 +96,8 @@ def _opened(path: Path) -> IO[bytes]:
 
 def _check_stored(path: Path, image: nibabel.Nifti1Image) -> None:
     """Refuse a file that holds fewer voxels than its header states, or more, of which some would be left out."""
-    shape, start, itemsize = image.shape, int(image.dataobj.offset), image.dataobj.dtype.itemsize
+    shape, voxels = image.shape, cast(ArrayProxy, image.dataobj)
+    start, itemsize = int(voxels.offset), voxels.dtype.itemsize
     stored = path.stat().st_size
     deflated = path.suffix.lower() == ".gz"
     n_bytes = check_size(shape, itemsize, stored - (0 if deflated else start), path, deflated) + start

@@ -104,7 +104,7 @@ def _signs_to_ras(header: Mapping[str, Any], path: Path) -> tuple[int, int, int]
 
 
 def _segments(header: Mapping[str, Any]) -> tuple[Segment, ...]:
-    """Segments of a Slicer segmentation; without values and layers, as Slicer 4.10 wrote it, one layer is one segment."""
+    """Segments of a Slicer segmentation; where none has a value, as in Slicer 4.10, each is a layer of its own."""
     numbers = sorted({int(found[1]) for key in header if (found := re.fullmatch(r"Segment(\d+)_\w+", key))})
     stated = any(f"Segment{n}_LabelValue" in header for n in numbers)
     return tuple(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -62,7 +62,7 @@ def checked(image: RawImage, least_voxels: int = 2) -> RawImage:
     check_values(values, path)
     affine = np.asarray(image.ras_from_ijk, dtype=float)
     check_affine(affine, path)
-    return RawImage(values, affine, path, image.segments)
+    return replace(image, values=values, ras_from_ijk=affine)
 
 
 def check_values(values: Array, path: Path) -> None:
@@ -96,7 +96,7 @@ def check_size(shape: Sequence[int], itemsize: int, stored_bytes: float, path: P
 def check_voxel_size(spacing: Array, ras_from_ijk: Array, shape: Sequence[int], key: str, path: Path) -> None:
     """Raise InputRefused where a voxel size stated apart, (3,) mm under `key`, contradicts the matrix.
 
-    Programs differ in which of the two they take, so neither is believed. Not finite or not positive is a contradiction.
+    Programs differ in which of the two they take, so neither is believed; a size that is not positive contradicts all.
     """
     by_matrix = np.linalg.norm(ras_from_ijk[:3, :3], axis=0)
     stated = np.asarray(spacing, dtype=float)

@@ -29,8 +29,8 @@ def union(image: RawImage) -> Mask:
 def region(image: RawImage, label: Label | Sequence[Label] | None, ask: str) -> Mask:
     """The one region of an image, or those that `label` names: numbers, or segments' names as the file has them.
 
-    Raises InputRefused where values are negative or neither labels nor shares, and where the image holds several regions
-    or none that is asked for; `ask` says how to choose.
+    Raises InputRefused where values are negative or neither labels nor shares, and where the image holds several
+    regions or none that is asked for; `ask` says how to choose.
     """
     layers, raw = _layers(image)
     if not all(_whole(layer) for layer in layers):
