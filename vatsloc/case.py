@@ -216,7 +216,7 @@ def _hints(file: CaseFile, paths: Mapping[str, Path], grids: tuple[Grid, Grid, G
         spines.append(None if point is None else np.array(point))
     lung = surface = None
     if "lung_mask_ct" in paths:
-        ask = "[hints] lung_label = ..."
+        ask = "[hints] lung_label = ... in case.toml"
         lung = mask_on(paths["lung_mask_ct"], ct, file.hints.lung_label, ask, warnings)
     if "deflated_surface" in paths:
         surface = read_hint_surface(paths["deflated_surface"], deflated, warnings)

@@ -59,7 +59,7 @@ def read_nodule(source: NoduleSource, ct: Grid, warnings: list[str]) -> Nodule:
     """
     mask = centre = None
     if source.mask is not None:
-        on_ct = mask_on(source.mask, ct, source.label, "[nodule] label = ...", warnings)
+        on_ct = mask_on(source.mask, ct, source.label, "[nodule] label = ... in case.toml", warnings)
         mask = _largest_part(on_ct, source.mask, warnings)
         centre = ct.to_ras(np.argwhere(mask.inside).mean(axis=0))
         _check_nodule_size(mask, source.mask)

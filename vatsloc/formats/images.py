@@ -66,7 +66,7 @@ def read_region(path: Path, label: Label | Sequence[Label] | None = None, ask: s
     """One region of a mask or a label image: the one it holds, or those of the labels (numbers or segments' names).
 
     Raises as `read_mask`, and InputRefused, with a list of what is there, when it holds several and `label` is None, or
-    not what `label` asks for. ask: what to write to choose one, for that sentence.
+    not what `label` asks for. ask: how to choose one, for that sentence.
     """
     return region(_read(path), label, ask)
 

@@ -41,9 +41,7 @@ def region(image: RawImage, label: Label | Sequence[Label] | None, ask: str) -> 
     if label is None:
         chosen = held
         if len(held) > 1:
-            raise InputRefused(
-                f"{raw.path} holds {len(held)} regions: {_listed(held)}; say which is meant by {ask} in case.toml."
-            )
+            raise InputRefused(f"{raw.path} holds {len(held)} regions: {_listed(held)}; say which is meant: {ask}.")
     else:
         wanted = [label] if isinstance(label, int | str) else list(label)
         chosen = [_asked_for(one, held, raw.path, ask) for one in wanted]
@@ -110,9 +108,7 @@ def _asked_for(label: Label, held: list[tuple[Segment, int]], path: Path, ask: s
     if len(matches) == 1:
         return matches[0]
     got = f"{len(matches)} regions" if matches else "nothing"
-    raise InputRefused(
-        f"{path} holds {got} of label {label!r} among {_listed(held)}; name one of these by {ask} in case.toml."
-    )
+    raise InputRefused(f"{path} holds {got} of label {label!r} among {_listed(held)}; name one of these: {ask}.")
 
 
 def _listed(held: list[tuple[Segment, int]]) -> str:
