@@ -29,6 +29,7 @@ _TYPES = {
     "MET_DOUBLE": "f8",
 }
 _MAX_HEADER_BYTES = 65536
+_YES, _NO = ("true", "t", "1"), ("false", "f", "0")
 MAX_LENGTH_ERROR = 1e-3
 """How far from 1 an axis of the TransformMatrix may be; the voxel size is stated apart."""
 
@@ -148,8 +149,8 @@ def _whole(header: dict[str, str], key: str, path: Path, n: int) -> list[int]:
 
 
 def _flag(header: dict[str, str], key: str, path: Path, default: bool = False) -> bool:
-    """Whether a key says yes, by its first letter as MetaIO reads it."""
-    first = header.get(key, str(default))[:1].upper()
-    if first not in ("T", "1", "F", "0"):
+    """Whether a key says yes."""
+    said = header.get(key, str(default)).lower()
+    if said not in (*_YES, *_NO):
         raise InputRefused(f"{path} has {key} = {header[key] or 'nothing'}, True or False needed; export it again.")
-    return first in ("T", "1")
+    return said in _YES
