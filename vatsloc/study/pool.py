@@ -49,7 +49,7 @@ def pool(jobs: int, scheduler: str | None) -> Iterator[Executor]:
         try:
             yield client.get_executor()
         except (CancelledError, OSError) as error:
-            if client.status == "running":
+            if isinstance(error, OSError) and client.status == "running":
                 raise
             raise CaseError(
                 f"the Dask scheduler at {scheduler} stopped answering; start it and run again, what is done is kept."
