@@ -276,28 +276,31 @@ def test_landmarks_never_placed_are_left_out_and_said(folders):
 
 
 @pytest.mark.parametrize(
-    ("scale", "shift", "sentence"),
+    ("image", "scale", "shift", "sentence"),
     [
+        ("ct", 1e-3, 0.0, r"12 landmarks of ct\.nii\.gz span 0\.03 x 0\.03 x 0\.045 mm, which no lung does; save them"),
         (
+            "cbct_inflated",
             1e-3,
             0.0,
-            r"12 landmarks of cbct_inflated\.nii\.gz span 0\.0\d+ x .* mm, which no lung does; save them in milli",
+            r"12 landmarks of cbct_inflated\.nii\.gz span 0\.0\d+ x .* mm, which no lung does",
         ),
         (
+            "cbct_inflated",
             1.0,
             400.0,
-            r"landmarks of cbct_inflated\.nii\.gz lie \d+ mm beyond it, 150 mm allowed; save them in that image's",
+            r"landmarks of cbct_inflated\.nii\.gz lie 594 mm beyond it, 150 mm allowed; save",
         ),
     ],
 )
-def test_landmarks_of_another_size_or_place_are_refused(folders, scale, shift, sentence):
+def test_landmarks_of_another_size_or_place_are_refused(folders, image, scale, shift, sentence):
     case, result = folders
 
     def change(points):
         for point in points:
             point["position"] = [scale * c + shift for c in point["position"]]
 
-    rewritten(case / "landmarks_cbct_inflated.mrk.json", change)
+    rewritten(case / f"landmarks_{image}.mrk.json", change)
     with pytest.raises(InputRefused, match=sentence):
         evaluate_case(case, result)
 

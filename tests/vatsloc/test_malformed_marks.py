@@ -21,6 +21,7 @@ from vatsloc.formats.casefile import read_case_file
 from vatsloc.formats.markups import PointList, read_points, write_points
 from vatsloc.formats.meshes import Surface, TetraMesh, read_surface, read_vtu, write_stl, write_vtu
 from vatsloc.formats.transforms import read_tfm, write_tfm
+from vatsloc.study.breaths import _landmarks
 
 POINTS = np.array([[10.0, 20, 30], [11.5, 20, 30], [10, 22.25, 30], [10, 20, 33]])
 TRIANGLES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
@@ -320,3 +321,13 @@ def test_points_written_here_are_read_as_the_mutations_begin(tmp_path: Path) -> 
     for name in ("p.fcsv", "p.mrk.json", "w.mrk.json"):
         assert np.array_equal(read_points(tmp_path / name).ras, RAS)
     assert np.allclose(sorted_corners(read_surface(tmp_path / "s.stl")), CORNERS)
+
+
+@pytest.mark.parametrize("cell", [b"1,5", b"\xff\xfe", b"", b"nan", b"six"])
+def test_cells_of_a_breath_s_landmarks_are_refused(tmp_path: Path, cell: bytes) -> None:
+    columns = b"insp_x,insp_y,insp_z,exp_x,exp_y,exp_z\n"
+    (tmp_path / "l.csv").write_bytes(columns + b"1,2,3,4,5,6\n1,2,3,4,5," + cell + b"\n")
+    with pytest.raises(InputRefused, match=r"l\.csv"):
+        _landmarks(tmp_path / "l.csv")
+    (tmp_path / "l.csv").write_bytes(columns + b"1,2,3,4,5,6\n")
+    assert _landmarks(tmp_path / "l.csv").tolist() == [[1, 2, 3, 4, 5, 6]]

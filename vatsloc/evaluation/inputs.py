@@ -92,6 +92,7 @@ def read_truth(case: Path) -> Truth:
         )
     triples = match(known.ct, known.cbct_inflated, known.cbct_deflated)
     images = read_case_file(case).images
+    _check_extent(known.ct, images.ct)
     seen: dict[str, Mask] = {}
     for image, file, points in (
         ("inflated", images.cbct_inflated, known.cbct_inflated),
@@ -99,26 +100,30 @@ def read_truth(case: Path) -> Truth:
     ):
         volume = read_volume(case / file)
         if points is not None:
-            _check_place(points, volume.grid, case / file)
+            _check_extent(points, file)
+            _check_place(points, volume.grid, file)
         seen[image] = field_of_view(volume).mask
     return Truth(triples, known, seen, _dense(case / "truth" / DENSE_FILE))
 
 
-def _check_place(points: PointList, grid: Grid, image: Path) -> None:
-    """Refuse landmarks whose extent or place cannot be a lung's: in metres, or in another frame than their image."""
-    low, high = points.ras.min(axis=0), points.ras.max(axis=0)
-    measured = " x ".join(f"{mm:.3g}" for mm in high - low)
-    if len(points) > 2 and not LANDMARKS_MM[0] <= float(np.linalg.norm(high - low)) <= LANDMARKS_MM[1]:
+def _check_extent(points: PointList, image: str) -> None:
+    """Refuse landmarks that span what no lung does, as those in metres."""
+    extent = np.ptp(points.ras, axis=0)
+    if len(points) > 2 and not LANDMARKS_MM[0] <= float(np.linalg.norm(extent)) <= LANDMARKS_MM[1]:
         raise InputRefused(
-            f"the {len(points)} landmarks of {image.name} span {measured} mm, which no lung does; "
-            "save them in millimetres."
+            f"the {len(points)} landmarks of {image} span {' x '.join(f'{mm:.3g}' for mm in extent)} mm, "
+            "which no lung does; save them in millimetres."
         )
+
+
+def _check_place(points: PointList, grid: Grid, image: str) -> None:
+    """Refuse landmarks that lie far from their image, as those in another frame."""
     ijk = grid.to_ijk(np.median(points.ras, axis=0))
-    beyond = np.maximum(np.maximum(-ijk, ijk - np.array(grid.shape) + 1), 0) * grid.spacing
-    if float(np.linalg.norm(beyond)) > MAX_BEYOND_MM:
+    beyond = float(np.linalg.norm(np.maximum(np.maximum(-ijk, ijk - np.array(grid.shape) + 1), 0) * grid.spacing))
+    if beyond > MAX_BEYOND_MM:
         raise InputRefused(
-            f"the landmarks of {image.name} lie {np.linalg.norm(beyond):.0f} mm beyond it, {MAX_BEYOND_MM:.0f} mm "
-            "allowed; save them in that image's frame."
+            f"the landmarks of {image} lie {beyond:.0f} mm beyond it, {MAX_BEYOND_MM:.0f} mm allowed; "
+            "save them in that image's frame."
         )
 
 

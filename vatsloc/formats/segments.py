@@ -13,7 +13,7 @@ import numpy as np
 
 from registration.volume import Array, Mask
 from vatsloc.errors import InputRefused
-from vatsloc.formats.raw import RawImage, Segment, check_values, checked
+from vatsloc.formats.raw import RawImage, Segment, checked
 
 Label = int | str
 _LISTED = 8
@@ -60,7 +60,6 @@ def _layers(image: RawImage) -> tuple[list[Array], RawImage]:
     if image.segments and parts[0].values.size == 1:
         raise InputRefused(f"{image.path} is a segmentation without voxels; draw the region and save it again.")
     for part in parts:
-        check_values(part.values, image.path)
         lowest = part.values.min()
         if lowest < 0:
             raise InputRefused(
