@@ -95,7 +95,8 @@ def test_shares_of_voxels_are_a_mask_and_other_fractions_are_not(tmp_path):
     shares = np.zeros((3, 3, 3), dtype=np.float32)
     shares[0, 0] = [0.4, 0.5, 1.0]
     save_nifti(nifti_image(shares, np.eye(4)), tmp_path / "shares.nii.gz")
-    assert np.argwhere(read_region(tmp_path / "shares.nii.gz").inside).tolist() == [[0, 0, 1], [0, 0, 2]]
+    for label in (None, 1, (1,)):
+        assert np.argwhere(read_region(tmp_path / "shares.nii.gz", label).inside).tolist() == [[0, 0, 1], [0, 0, 2]]
     save_nifti(nifti_image(shares * 5, np.eye(4)), tmp_path / "smeared.nii.gz")
     with pytest.raises(InputRefused, match="values up to 5 that are no whole numbers, so neither labels nor shares"):
         read_region(tmp_path / "smeared.nii.gz")

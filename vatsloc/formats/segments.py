@@ -33,17 +33,17 @@ def region(image: RawImage, label: Label | Sequence[Label] | None, ask: str) -> 
     regions or none that is asked for; `ask` says how to choose.
     """
     layers, raw = _layers(image)
+    wanted = None if label is None else [label] if isinstance(label, int | str) else list(label)
     if not all(_whole(layer) for layer in layers):
-        return _of_shares(layers, raw, label)
+        return _of_shares(layers, raw, wanted)
     held = _held(layers, image.segments)
     if not held:
         raise InputRefused(f"{raw.path} is an empty mask; draw the region and save it again.")
-    if label is None:
+    if wanted is None:
         chosen = held
         if len(held) > 1:
             raise InputRefused(f"{raw.path} holds {len(held)} regions: {_listed(held)}; say which is meant: {ask}.")
     else:
-        wanted = [label] if isinstance(label, int | str) else list(label)
         chosen = [_asked_for(one, held, raw.path, ask) for one in wanted]
     inside = np.zeros(layers[0].shape, dtype=bool)
     for segment, _ in chosen:
@@ -76,10 +76,10 @@ def _marked(values: Array) -> Array:
     return values if values.dtype == bool else values >= 0.5
 
 
-def _of_shares(layers: list[Array], raw: RawImage, label: object) -> Mask:
+def _of_shares(layers: list[Array], raw: RawImage, wanted: list[Label] | None) -> Mask:
     """Region of an image that says how much of each voxel belongs to it."""
     highest = max(float(layer.max()) for layer in layers)
-    if len(layers) > 1 or highest > 1 or label not in (None, 1, [1]):
+    if len(layers) > 1 or highest > 1 or wanted not in (None, [1]):
         raise InputRefused(
             f"{raw.path} has values up to {highest:g} that are no whole numbers, so neither labels nor shares of "
             "voxels from 0 to 1; export it as a label image without interpolation."
