@@ -1,5 +1,7 @@
 """The nodule as users mark it: label images, segmentations, cropped masks, points; and what is refused."""
 
+# ruff: noqa: F401, F811  (the fixture `folder` comes from the tests of whole cases)
+
 from __future__ import annotations
 
 import json
@@ -10,7 +12,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from registration.volume import Grid, Mask
-from tests.vatsloc.test_case import CENTRE, ball, folder, grid_at, point, refused, write_toml  # noqa: F401
+from tests.vatsloc.test_case import CENTRE, ball, folder, grid_at, point, refused, write_toml
 from vatsloc.case import read_case
 from vatsloc.errors import CaseError, InputRefused
 from vatsloc.formats.images import read_mask, read_region
@@ -58,14 +60,14 @@ def nodule_of(path: Path, grid: Grid, label: int | str | None = None) -> tuple[M
     return nodule.mask, nodule.centre_ras, warnings
 
 
-def test_a_label_map_without_a_label_is_refused_and_listed(folder):  # noqa: F811
+def test_a_label_map_without_a_label_is_refused_and_listed(folder):
     lung, nodule = ball(grid_at(), LUNG, 40.0), ball(grid_at())
     label_map(folder / "nodule.nii.gz", lung, nodule)
     counts = f"1 with {lung.inside.sum()} voxels, 2 with {nodule.inside.sum()} voxels"
     refused(folder, InputRefused, rf"holds 2 regions: {counts}; say which is meant: \[nodule\] label = \.\.\.")
 
 
-def test_the_label_chooses_the_nodule(folder):  # noqa: F811
+def test_the_label_chooses_the_nodule(folder):
     label_map(folder / "nodule.nii.gz", ball(grid_at(), LUNG, 40.0), ball(grid_at()))
     write_toml(folder, nodule={"mask": "nodule.nii.gz", "label": 2})
     nodule = read_case(folder).nodule
@@ -180,7 +182,7 @@ def test_what_lies_beyond_the_ct_is_said(tmp_path):
     assert warnings == ["n.nii.gz: 30 % of the region lies outside the CT and was cut off."]
 
 
-def test_a_mask_as_large_as_a_lung_is_no_nodule(folder):  # noqa: F811
+def test_a_mask_as_large_as_a_lung_is_no_nodule(folder):
     write_mask(folder / "nodule.nii.gz", ball(grid_at(), LUNG, 50.0))
     refused(
         folder, InputRefused, r"marks \d+ ml, 100 x 100 x 100 mm, up to 250 ml expected of a nodule; draw the nodule"
@@ -188,7 +190,7 @@ def test_a_mask_as_large_as_a_lung_is_no_nodule(folder):  # noqa: F811
 
 
 @pytest.mark.parametrize("status", ["undefined", "preview", "missing"])
-def test_points_never_placed_are_left_out_and_said(folder, status):  # noqa: F811
+def test_points_never_placed_are_left_out_and_said(folder, status):
     point(folder / "p.mrk.json", CENTRE, CENTRE + 30)
     content = json.loads((folder / "p.mrk.json").read_text())
     content["markups"][0]["controlPoints"][1]["positionStatus"] = status
@@ -199,14 +201,14 @@ def test_points_never_placed_are_left_out_and_said(folder, status):  # noqa: F81
     assert case.warnings == ("p.mrk.json: L1 was never placed and was left out.",)
 
 
-def test_a_point_in_metres_is_refused(folder):  # noqa: F811
+def test_a_point_in_metres_is_refused(folder):
     point(folder / "p.mrk.json", CENTRE / 1000)
     write_toml(folder, nodule={"point": "p.mrk.json"})
     refused(folder, InputRefused, r"a point at 0\.06, 0\.01, -0\.02 \(RAS\), which reads like metres; save it in mill")
 
 
 @pytest.mark.parametrize(("scale", "measured"), [(1e-3, "0.0707 x 0.0707 x 0.0707"), (100.0, "7.07e")])
-def test_a_surface_of_another_size_is_refused(folder, scale, measured):  # noqa: F811
+def test_a_surface_of_another_size_is_refused(folder, scale, measured):
     """A sphere 100 mm wide, in metres and in hundredths: its corners measure 70.7 mm along each axis."""
     corners = np.array([[a, b, c] for a in (-1, 1) for b in (-1, 1) for c in (-1, 1)]) * 50 / np.sqrt(2)
     write_points(folder / "s.mrk.json", PointList(corners * scale, tuple("abcdefgh")))
@@ -221,14 +223,14 @@ def test_a_surface_of_another_size_is_refused(folder, scale, measured):  # noqa:
         (1e3, r"has voxels of 10000 x 10000 x 10000 mm at .* mm; re-export it with its true size and place"),
     ],
 )
-def test_an_image_of_another_unit_is_refused(folder, scale, sentence):  # noqa: F811
+def test_an_image_of_another_unit_is_refused(folder, scale, sentence):
     case = read_case(folder)
     affine = case.ct.ras_from_ijk @ np.diag([scale, scale, scale, 1])
     save_nifti(nifti_image(case.ct.hu.astype(np.int16), affine), folder / "ct.nii.gz")
     refused(folder, InputRefused, sentence)
 
 
-def test_a_case_file_with_a_byte_order_mark_is_read(folder):  # noqa: F811
+def test_a_case_file_with_a_byte_order_mark_is_read(folder):
     plain = read_case(folder)
     text = (folder / "case.toml").read_text()
     (folder / "case.toml").write_text(text, encoding="utf-8-sig")
@@ -246,6 +248,6 @@ def test_a_case_file_with_a_byte_order_mark_is_read(folder):  # noqa: F811
         ({"mask": "nodule.nii.gz", "lable": 2}, r"\[nodule\] lable is an unknown key; mask, point, label are known"),
     ],
 )
-def test_labels_that_are_none_are_refused(folder, nodule, sentence):  # noqa: F811
+def test_labels_that_are_none_are_refused(folder, nodule, sentence):
     write_toml(folder, nodule=nodule)
     refused(folder, CaseError, sentence)
