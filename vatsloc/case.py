@@ -18,8 +18,9 @@ from scipy import ndimage
 from registration.resample import resample_mask
 from registration.volume import Array, Grid, Mask, Volume, axis_codes
 from vatsloc.errors import CaseError, InputRefused
-from vatsloc.formats.casefile import CaseFile, PleuralGas, Side, Triple, read_case_file
-from vatsloc.formats.images import files_behind, read_mask, read_volume
+from vatsloc.formats.casefile import CaseFile, PleuralGas, SeriesName, Side, Triple, read_case_file
+from vatsloc.formats.dicom.regions import holds_regions
+from vatsloc.formats.images import files_behind, read_mask, read_volume_and_warnings, stated_frame
 from vatsloc.formats.markups import PointList, read_points
 from vatsloc.formats.meshes import Surface, read_surface
 from vatsloc.frames import reorient
@@ -94,24 +95,26 @@ def read_case(folder: Path) -> Case:
     paths = _input_paths(folder, file)
     gravity = _gravity(file.side, file.setup.gravity_cbct)
     with ThreadPoolExecutor(max_workers=2) as pool:  # decompression and hashing release the interpreter lock
-        images = pool.map(_read_image, (paths["ct"], paths["cbct_inflated"], paths["cbct_deflated"]))
+        names = ("ct", "cbct_inflated", "cbct_deflated")
+        images = pool.map(lambda name: _read_image(paths[name], file.images.series(name)), names)
         digests = pool.map(sha256, paths.values())
-        (ct, ct_axes), (inflated, inflated_axes), (deflated, deflated_axes) = images
+        (ct, ct_axes, said), (inflated, inflated_axes, said_inflated), (deflated, deflated_axes, said_deflated) = images
         input_sha256 = dict(zip(paths, digests, strict=True))
     for name in ("cbct_inflated", "cbct_deflated"):
         _check_overlap(ct.grid, (inflated if name == "cbct_inflated" else deflated).grid, paths["ct"], paths[name])
     _check_overlap(inflated.grid, deflated.grid, paths["cbct_inflated"], paths["cbct_deflated"])
-    warnings: list[str] = []
+    warnings = [*said, *said_inflated, *said_deflated]
+    frame = _frame_of_ct(paths, file)
     return Case(
         folder=folder,
         side=file.side,
         ct=ct,
         cbct_inflated=inflated,
         cbct_deflated=deflated,
-        nodule=_nodule(paths, ct.grid, warnings),
+        nodule=_nodule(paths, ct.grid, frame, warnings),
         gravity_ras=gravity,
         pleural_gas=file.setup.pleural_gas,
-        hints=_hints(file, paths, (ct.grid, inflated.grid, deflated.grid), warnings),
+        hints=_hints(file, paths, (ct.grid, inflated.grid, deflated.grid), frame, warnings),
         input_sha256=input_sha256,
         stored_axes={"ct": ct_axes, "cbct_inflated": inflated_axes, "cbct_deflated": deflated_axes},
         warnings=tuple(warnings),
@@ -173,8 +176,9 @@ def _gravity(side: Side, stated: Triple | None) -> Array:
     return gravity
 
 
-def _read_image(path: Path) -> tuple[Volume, str]:
-    volume = read_volume(path)
+def _read_image(path: Path, series: SeriesName | None) -> tuple[Volume, str, tuple[str, ...]]:
+    """The image, the order of its axes as stored, and warnings of its reader."""
+    volume, warnings = read_volume_and_warnings(path, series)
     lowest = float(np.percentile(volume.hu[::4, ::4, ::4], 1))
     if lowest > MAX_AIR_HU:
         raise InputRefused(
@@ -182,7 +186,7 @@ def _read_image(path: Path) -> tuple[Volume, str]:
             "export it with its rescale to HU."
         )
     hu, ras_from_ijk = reorient(volume.hu, volume.ras_from_ijk, AXES)
-    return Volume(np.ascontiguousarray(hu), ras_from_ijk), axis_codes(volume.ras_from_ijk)
+    return Volume(np.ascontiguousarray(hu), ras_from_ijk), axis_codes(volume.ras_from_ijk), warnings
 
 
 def _check_overlap(a: Grid, b: Grid, path_a: Path, path_b: Path) -> None:
@@ -208,10 +212,10 @@ def _inside(grid: Grid, points_ras: Array) -> Array:
     return np.asarray(((ijk >= -0.5) & (ijk <= np.array(grid.shape) - 0.5)).all(axis=-1))
 
 
-def _nodule(paths: Mapping[str, Path], ct: Grid, warnings: list[str]) -> Nodule:
+def _nodule(paths: Mapping[str, Path], ct: Grid, frame: str, warnings: list[str]) -> Nodule:
     mask = centre = None
     if "nodule_mask" in paths:
-        mask = _largest_part(_mask_on(paths["nodule_mask"], ct), paths["nodule_mask"], warnings)
+        mask = _largest_part(_mask_on(paths["nodule_mask"], ct, frame), paths["nodule_mask"], warnings)
         centre = ct.to_ras(np.argwhere(mask.inside).mean(axis=0))
     if "nodule_point" in paths:
         point = _one_point(paths["nodule_point"])
@@ -229,9 +233,15 @@ def _nodule(paths: Mapping[str, Path], ct: Grid, warnings: list[str]) -> Nodule:
     return Nodule(centre, mask)
 
 
-def _mask_on(path: Path, grid: Grid) -> Mask:
-    """Mask of a file on the CT's grid."""
-    mask = read_mask(path)
+def _frame_of_ct(paths: Mapping[str, Path], file: CaseFile) -> str:
+    """Frame of reference of a DICOM CT, where a region drawn in DICOM has to be compared with it; else ""."""
+    drawn = any(key in paths and holds_regions(paths[key]) for key in ("nodule_mask", "lung_mask_ct"))
+    return stated_frame(paths["ct"], file.images.ct_series) if drawn else ""
+
+
+def _mask_on(path: Path, grid: Grid, frame: str) -> Mask:
+    """Mask of a file on the CT's grid. frame: of reference of the CT."""
+    mask = read_mask(path, grid, frame)
     inside, ras_from_ijk = reorient(mask.inside, mask.ras_from_ijk, AXES)
     mask = Mask(np.ascontiguousarray(inside), ras_from_ijk)
     if not _inside(grid, mask.grid.to_ras(np.argwhere(mask.inside).mean(axis=0))):
@@ -262,7 +272,9 @@ def _largest_part(mask: Mask, path: Path, warnings: list[str]) -> Mask:
     return Mask(labels == largest + 1, mask.ras_from_ijk)
 
 
-def _hints(file: CaseFile, paths: Mapping[str, Path], grids: tuple[Grid, Grid, Grid], warnings: list[str]) -> Hints:
+def _hints(
+    file: CaseFile, paths: Mapping[str, Path], grids: tuple[Grid, Grid, Grid], frame: str, warnings: list[str]
+) -> Hints:
     ct, inflated, deflated = grids
     spines: list[Array | None] = []
     for key, point, grid in (
@@ -274,7 +286,7 @@ def _hints(file: CaseFile, paths: Mapping[str, Path], grids: tuple[Grid, Grid, G
                 f"{key} = {list(point)} in case.toml lies outside its image; give RAS millimetres inside it."
             )
         spines.append(None if point is None else np.array(point))
-    lung = _mask_on(paths["lung_mask_ct"], ct) if "lung_mask_ct" in paths else None
+    lung = _mask_on(paths["lung_mask_ct"], ct, frame) if "lung_mask_ct" in paths else None
     surface = None
     if "deflated_surface" in paths:
         surface = read_surface(paths["deflated_surface"])

@@ -88,8 +88,8 @@ def read_truth(case: Path) -> Truth:
     triples = match(known.ct, known.cbct_inflated, known.cbct_deflated)
     images = read_case_file(case).images
     seen = {
-        "inflated": field_of_view(read_volume(case / images.cbct_inflated)).mask,
-        "deflated": field_of_view(read_volume(case / images.cbct_deflated)).mask,
+        "inflated": field_of_view(read_volume(case / images.cbct_inflated, images.cbct_inflated_series)).mask,
+        "deflated": field_of_view(read_volume(case / images.cbct_deflated, images.cbct_deflated_series)).mask,
     }
     return Truth(triples, known, seen, _dense(case / "truth" / DENSE_FILE))
 

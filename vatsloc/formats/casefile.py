@@ -20,6 +20,7 @@ PleuralGas = Literal["air", "co2"]
 Coordinate = Annotated[float, Field(allow_inf_nan=False)]
 Triple = tuple[Coordinate, Coordinate, Coordinate]
 FileName = Annotated[str, Field(min_length=1)]
+SeriesName = Annotated[int, Field(strict=True)] | FileName
 
 
 class _Table(BaseModel):
@@ -27,11 +28,20 @@ class _Table(BaseModel):
 
 
 class ImageFiles(_Table):
-    """Paths relative to the case folder."""
+    """Paths relative to the case folder. *_series: UID, number or description of the series to take in a DICOM folder
+    that holds several."""
 
     ct: FileName
     cbct_inflated: FileName
     cbct_deflated: FileName
+    ct_series: SeriesName | None = None
+    cbct_inflated_series: SeriesName | None = None
+    cbct_deflated_series: SeriesName | None = None
+
+    def series(self, image: str) -> SeriesName | None:
+        """What is stated of the image's series: "ct", "cbct_inflated" or "cbct_deflated"."""
+        stated: SeriesName | None = getattr(self, f"{image}_series")
+        return stated
 
 
 class NoduleFiles(_Table):

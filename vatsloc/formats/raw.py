@@ -15,12 +15,27 @@ MAX_SHEAR = 1e-3
 
 
 @dataclass(frozen=True)
+class Segment:
+    """A named region of a label image. label: its voxels' value; layer: index of the label image that holds it."""
+
+    label: int
+    name: str
+    layer: int = 0
+
+
+@dataclass(frozen=True)
 class RawImage:
-    """Voxels as stored. values: (ni, nj, nk[, 1...]); ras_from_ijk: (4, 4), mm; path: file or folder it came from."""
+    """Voxels as stored. values: (ni, nj, nk[, 1...]), or (ni, nj, nk, layers) of a segmentation whose segments overlap.
+
+    ras_from_ijk: (4, 4), mm; path: file or folder it came from; segments: what the file names, none in most formats;
+    warnings: what its reader left out or doubts, a sentence each.
+    """
 
     values: Array
     ras_from_ijk: Array
     path: Path
+    segments: tuple[Segment, ...] = ()
+    warnings: tuple[str, ...] = ()
 
 
 def checked(image: RawImage) -> RawImage:
@@ -42,7 +57,7 @@ def checked(image: RawImage) -> RawImage:
     if values.dtype.kind == "f" and not np.isfinite(values).all():
         n_bad = int(values.size - np.isfinite(values).sum())
         raise InputRefused(f"{path} has {n_bad} voxels that are not finite numbers; repair or re-export it.")
-    return RawImage(values, affine, path)
+    return RawImage(values, affine, path, image.segments, image.warnings)
 
 
 def check_affine(ras_from_ijk: Array, path: Path) -> None:
