@@ -111,7 +111,7 @@ def find_series(path: Path, wanted: str | int | None = None) -> Series:
     chosen = _choose(all_series, aside, wanted, path)
     said = _said(aside, [series for series in all_series if series is not chosen], path)
     if missing:
-        said = (*said, f"{path.name}: the DICOMDIR records {_files(missing)} that are not there.")
+        said = (*said, f"{path.name}: {missing} of the files that its DICOMDIR records are not there.")
     return Series(chosen.images, said, aside_of[chosen.images[0].text("SeriesInstanceUID")])
 
 
