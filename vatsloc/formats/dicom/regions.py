@@ -93,6 +93,8 @@ def _read_segmentation(header: Header) -> RawImage:
     pixels = next(stored_pixels([header]))
     shape = (*pixels.shape[:0:-1], int(index.max()) + 2)
     if header.text("SegmentationType") == "LABELMAP":
+        if len(set(index.tolist())) < len(index):
+            raise InputRefused(f"{header.file} has two label maps at the same place; export the segmentation again.")
         values = np.zeros(shape, dtype=np.uint16)
         for k, frame in zip(index, pixels, strict=True):
             values[:, :, k] = frame.T
