@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from vatsloc.errors import InputRefused
 from vatsloc.formats.dicom.frames import frames_of, lattice, missing_ends
 from vatsloc.formats.dicom.header import Header
 from vatsloc.formats.dicom.pixels import PADDING_HU, check_pixels, scale_of, stored_pixels
@@ -35,6 +36,8 @@ def read_dicom(path: Path, series: str | int | None = None) -> RawImage:
     frames = sorted(frames_of(found.images, path), key=lambda frame: frame.place)
     lps_from_ijk = lattice(frames, path, found.left_out)
     scales = [scale_of(frame.header, frame.rescale) for frame in frames]
+    if len({scale.stated for scale in scales}) > 1:
+        raise InputRefused(f"{path} has slices of which some lack their rescale to HU; export the whole series again.")
     first = frames[0].header
     shape = first.whole("Rows", 1, 65535), first.whole("Columns", 1, 65535)
     hu = np.empty((len(frames), *shape), dtype=np.float32)

@@ -36,7 +36,8 @@ _NOT_HU = ("OD", "MGML", "Z_EFF", "ED", "EDW", "PCT")
 class Scale:
     """From stored pixels to HU: by the table if there is one, then slope * pixels + intercept.
 
-    table: (n,) float32 for stored values from `first`; padding: lowest and highest stored value without meaning.
+    table: (n,) float32 for stored values from `first`; padding: lowest and highest stored value without meaning;
+    stated: by which of its attributes, "" where there is none and pixels are taken for HU.
     """
 
     slope: float
@@ -44,6 +45,7 @@ class Scale:
     table: Array | None
     first: int
     padding: tuple[int, int] | None
+    stated: str
 
     def __call__(self, stored: Array) -> Array:
         """HU, float32, of whole numbers as stored, (rows, columns)."""
@@ -80,7 +82,8 @@ def scale_of(header: Header, rescale: Header) -> Scale:
     if kind in _NOT_HU:
         raise rescale.wrong("RescaleType", kind, "HU")
     table, first = _table(header)
-    return Scale(slope, intercept, table, first, _padding(header))
+    by = "RescaleSlope" if "RescaleSlope" in rescale else ""
+    return Scale(slope, intercept, table, first, _padding(header), by if table is None else "ModalityLUTSequence")
 
 
 def check_pixels(header: Header) -> None:
@@ -253,14 +256,17 @@ def _table(header: Header) -> tuple[Array | None, int]:
         raise item.wrong("LUTDescriptor", f"{bits} bits an entry", "8 or 16")
     data = item.value("LUTData")
     if isinstance(data, bytes):  # written as OW
-        data = np.frombuffer(data[: 2 * n], np.uint16 if header.dataset.is_little_endian else ">u2")
+        if len(data) != 2 * n:
+            raise item.wrong("LUTData", f"{len(data)} bytes", f"{2 * n} by its LUTDescriptor")
+        data = np.frombuffer(data, "<u2" if header.dataset.original_encoding[1] is not False else ">u2")
     entries = np.atleast_1d(np.asarray(data if data is not None else [], dtype=np.int64))
     if entries.shape != (n,):
         raise item.wrong("LUTData", f"{entries.size} entries", f"{n} by its LUTDescriptor")
-    if item.text("ModalityLUTType").upper() == "HU":
+    kind = item.text("ModalityLUTType").strip().upper()
+    if kind not in ("HU", "US"):
+        raise item.wrong("ModalityLUTType", kind or "nothing", "HU or US")
+    if kind == "HU":
         entries = np.where(entries >= 32768, entries - 65536, entries)
-    elif item.text("ModalityLUTType").upper() == "OD":
-        raise item.wrong("ModalityLUTType", "OD", "HU")
     if header.whole("PixelRepresentation", 0, 1) == 1 and first >= 32768:
         first -= 65536
     return entries.astype(np.float32), first
