@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
 import gdcm
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from numpy.testing import assert_array_equal
 from pydicom.dataset import Dataset
 from pydicom.encaps import encapsulate, generate_frames
 from pydicom.sequence import Sequence
-from pydicom.uid import HTJ2KLossless, RLELossless
+from pydicom.uid import HTJ2KLossless, JPEGBaseline8Bit, RLELossless
 
 from tests.vatsloc.dicom_made import NK, compressed, ct_slice, enhanced, save
 from vatsloc.errors import InputRefused
@@ -228,4 +229,22 @@ def test_what_is_not_hu_is_refused(tmp_path, change, sentence):
     slices = slices_of(noise(-1000, 1000), True, 16)
     change(slices[1])
     with pytest.raises(InputRefused, match=f"IM001 states .*{sentence}|IM001 {sentence}"):
+        read(tmp_path / "ct", slices)
+
+
+def test_jpeg_of_8_bits_is_read_within_its_loss(tmp_path):
+    grey = np.tile(np.linspace(0, 255, SHAPE[1]), (SHAPE[0], 1)).astype(np.uint8)
+    slices = slices_of(np.zeros((3, *SHAPE), int), False, 16)
+    for ds in slices:
+        ds.BitsAllocated, ds.BitsStored, ds.HighBit, ds.RescaleSlope = 8, 8, 7, 8
+        ds.file_meta.TransferSyntaxUID = JPEGBaseline8Bit
+        ds.PixelData = encapsulate([cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()])
+    assert np.abs(read(tmp_path / "ct", slices) - (grey * 8.0 - 1024)).max() <= 3 * 8
+
+
+def test_jpeg_of_12_bits_with_loss_is_refused_with_its_name(tmp_path):
+    slices = slices_of(noise(-1024, 3071), False, 12)
+    for ds in slices:
+        compressed(ds, T.JPEGExtendedProcess2_4, tmp_path)
+    with pytest.raises(InputRefused, match=r"IM000 .*JPEG Extended .*12-bit precision\); export it uncompressed"):
         read(tmp_path / "ct", slices)

@@ -124,7 +124,7 @@ def _frame(header: Header, k: int, position: Array, groups: tuple[Header, Header
     axes = orientation.numbers("ImageOrientationPatient", 6)
     row, column = axes[:3], axes[3:]
     lengths = float(np.linalg.norm(row)), float(np.linalg.norm(column))
-    if max(abs(lengths[0] - 1), abs(lengths[1] - 1), abs(row @ column)) > _SAME_AXES:
+    if max(abs(lengths[0] - 1), abs(lengths[1] - 1), abs(float(row @ column))) > _SAME_AXES:
         raise orientation.wrong("ImageOrientationPatient", axes.tolist(), "two unit vectors at a right angle")
     spacing = measures.numbers("PixelSpacing", 2)
     if spacing.min() <= 0:
