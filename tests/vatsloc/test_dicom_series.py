@@ -280,11 +280,12 @@ def angiographic_3d(where: str) -> Dataset:
                 setattr(frame, name, Sequence([group]))
         else:
             setattr(holder, name, Sequence([group]))
-    if where == "first position and spacing":
+    if where.startswith("first position"):
         first = Dataset()
         first.ImagePositionPatient = position(AXIAL, 0).tolist()
         holder.PlanePositionSequence = Sequence([first])
-        ds.SharedFunctionalGroupsSequence = Sequence([holder])
+        name = "XRay3DReconstructionSequence" if "reconstruction" in where else "SharedFunctionalGroupsSequence"
+        setattr(ds, name, Sequence([holder]))
     else:
         ds.PerFrameFunctionalGroupsSequence = Sequence(frames)
         name = "XRay3DReconstructionSequence" if "reconstruction" in where else "SharedFunctionalGroupsSequence"
@@ -293,9 +294,27 @@ def angiographic_3d(where: str) -> Dataset:
     return ds
 
 
+def test_enhanced_files_of_one_frame_each_are_stacked(tmp_path):
+    whole = enhanced(AXIAL, list(range(NK)))
+    stack = np.frombuffer(whole.PixelData, "<i2").reshape(NK, NJ, NI)
+    files = []
+    for k in range(NK):
+        ds = enhanced(AXIAL, [k])
+        ds.PixelData = stack[k].tobytes()
+        files.append(ds)
+    check(save(tmp_path / "cbct", files))
+
+
 @pytest.mark.parametrize(
     "where",
-    ["shared", "each frame", "reconstruction", "reconstruction, without groups", "first position and spacing"],
+    [
+        "shared",
+        "each frame",
+        "reconstruction",
+        "reconstruction, without groups",
+        "first position and spacing",
+        "first position and spacing in the reconstruction",
+    ],
 )
 def test_volumes_of_c_arms(tmp_path, where):
     volume, said = read_volume_and_warnings(save(tmp_path / "cbct", [angiographic_3d(where)]))

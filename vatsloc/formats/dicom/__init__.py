@@ -6,14 +6,15 @@ value that is read. Ref: DICOM PS3.3.
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
 
 from vatsloc.errors import InputRefused
-from vatsloc.formats.dicom.frames import frames_of, lattice, missing_ends
+from vatsloc.formats.dicom.frames import Frame, frames_of, lattice, missing_ends
 from vatsloc.formats.dicom.header import Header
-from vatsloc.formats.dicom.pixels import PADDING_HU, check_pixels, scale_of, stored_pixels
+from vatsloc.formats.dicom.pixels import PADDING_HU, Scale, check_pixels, scale_of, stored_pixels
 from vatsloc.formats.dicom.series import dicom_files, find_series, is_directory
 from vatsloc.formats.guard import guarded
 from vatsloc.formats.raw import RawImage
@@ -36,8 +37,7 @@ def read_dicom(path: Path, series: str | int | None = None) -> RawImage:
     frames = sorted(frames_of(found.images, path), key=lambda frame: frame.place)
     lps_from_ijk = lattice(frames, path, found.left_out)
     scales = [scale_of(frame.header, frame.rescale) for frame in frames]
-    if len({scale.stated for scale in scales}) > 1:
-        raise InputRefused(f"{path} has slices of which some lack their rescale to HU; export the whole series again.")
+    _check_one_scale(frames, scales)
     first = frames[0].header
     shape = first.whole("Rows", 1, 65535), first.whole("Columns", 1, 65535)
     hu = np.empty((len(frames), *shape), dtype=np.float32)
@@ -52,9 +52,21 @@ def read_dicom(path: Path, series: str | int | None = None) -> RawImage:
     return RawImage(hu.T, flip_affine(lps_from_ijk), path, warnings=warnings)
 
 
+@guarded("DICOM image")
 def frame_of_reference(path: Path, series: str | int | None = None) -> str:
     """FrameOfReferenceUID of the image of a folder or file, "" where it states none."""
     return find_series(path, series).images[0].text("FrameOfReferenceUID")
+
+
+def _check_one_scale(frames: list[Frame], scales: list[Scale]) -> None:
+    """Raise InputRefused for a slice that states its HU in another way than most of its series, or not at all."""
+    usual = Counter(scale.stated for scale in scales).most_common(1)[0][0]
+    for frame, scale in zip(frames, scales, strict=True):
+        if scale.stated != usual:
+            raise InputRefused(
+                f"{frame.header.file} states {scale.stated or 'no rescale'}, {usual or 'no rescale'} elsewhere in its "
+                "series; export the whole series again."
+            )
 
 
 def _loss(header: Header, path: Path) -> list[str]:

@@ -56,9 +56,7 @@ def frames_of(images: Sequence[Header], path: Path) -> list[Frame]:
     Raises InputRefused for files that do not belong together and for missing or malformed positions.
     """
     counts = [image.whole("NumberOfFrames", 1, MAX_FRAMES, 1) for image in images]
-    if len(images) == 1 and counts[0] > 1:
-        return frames_of_file(images[0])
-    if max(counts) > 1:
+    if len(images) > 1 and max(counts) > 1:
         raise InputRefused(
             f"{path} holds {len(images)} files of which some are multi-frame; keep one image per folder."
         )
@@ -67,12 +65,12 @@ def frames_of(images: Sequence[Header], path: Path) -> list[Frame]:
         raise InputRefused(
             f"{path} mixes {len(frames_of_reference)} frames of reference; keep the slices of one series in the folder."
         )
-    return [_frame(image, 0, image.numbers("ImagePositionPatient", 3), (image, image, image)) for image in images]
+    return [frame for image in images for frame in frames_of_file(image)]
 
 
 def frames_of_file(header: Header) -> list[Frame]:
-    """Frames of a multi-frame file, in its order."""
-    n = header.whole("NumberOfFrames", 1, MAX_FRAMES)
+    """Frames of a file, in its order."""
+    n = header.whole("NumberOfFrames", 1, MAX_FRAMES, 1)
     own = header.items("PerFrameFunctionalGroupsSequence")
     if own and len(own) != n:
         raise header.wrong("PerFrameFunctionalGroupsSequence", f"{len(own)} items", f"{n} by NumberOfFrames")
@@ -107,7 +105,9 @@ def _group(header: Header, places: Sequence[Header], group: str, name: str) -> H
 def _position_by_offset(header: Header, k: int, n: int, first: Header, orientation: Header, measures: Header) -> Array:
     """Position of frame k where only the first one is stated: along the normal by offset vector or by spacing."""
     axes = orientation.numbers("ImageOrientationPatient", 6)
-    if "GridFrameOffsetVector" in header:
+    if n == 1:
+        offset = 0.0
+    elif "GridFrameOffsetVector" in header:
         offset = float(header.numbers("GridFrameOffsetVector", n)[k])
     else:
         stated = header if "SpacingBetweenSlices" in header else measures

@@ -26,6 +26,7 @@ OFF_LATTICE = 0.05
 MAX_SLICES = 10_000
 
 
+@guarded("file", "check its permissions")
 def holds_regions(path: Path) -> bool:
     """Whether a file is a DICOM Segmentation or RT Structure Set; False for folders and all other files."""
     if not path.is_file():

@@ -30,6 +30,8 @@ _X_RAY = (
     EnhancedXAImageStorage,
     EnhancedXRFImageStorage,
 )
+_GROUPS = ("SharedFunctionalGroupsSequence", "PerFrameFunctionalGroupsSequence", "XRay3DReconstructionSequence")
+_PLACES = ("ImagePositionPatient", "PlanePositionSequence")
 _NO_DICOM, _COLOUR, _LOCALIZER, _PROJECTIONS, _SINGLE = (
     "no DICOM file",
     "colour image",
@@ -130,11 +132,10 @@ def _aside(header: Header) -> str:
 
 
 def _is_projection(header: Header) -> bool:
-    """Whether a file of an X-ray system holds views from many angles: several frames that state no place."""
+    """Whether a file of an X-ray system holds views from one or many angles, which have no place in space."""
     x_ray = header.text("SOPClassUID") in _X_RAY or header.text("Modality") in ("XA", "RF")
-    groups = header.items("SharedFunctionalGroupsSequence") + header.items("PerFrameFunctionalGroupsSequence")[:1]
-    placed = "ImagePositionPatient" in header or any("PlanePositionSequence" in group for group in groups)
-    return x_ray and not placed
+    groups = [header, *(group for name in _GROUPS for group in header.items(name)[:1])]
+    return x_ray and not any(place in group for group in groups for place in _PLACES)
 
 
 def _choose(found: list[Series], aside: dict[Path, str], wanted: str | int | None, path: Path) -> Series:
