@@ -308,9 +308,10 @@ def folder(tmp_path) -> Path:
     return tmp_path
 
 
-def write_case(folder: Path, **images: object) -> None:
+def write_case(folder: Path, label: int | str | None = None, **images: object) -> None:
     files = {"ct": "ct", "cbct_inflated": "cbct_inflated.nii.gz", "cbct_deflated": "cbct_deflated.nii.gz"}
-    write_toml(folder, images={**files, **images}, nodule={"mask": "nodule.dcm"})
+    nodule = {"mask": "nodule.dcm"} if label is None else {"mask": "nodule.dcm", "label": label}
+    write_toml(folder, images={**files, **images}, nodule=nodule)
 
 
 @pytest.mark.parametrize("kind", ["SEG", "RTSTRUCT"])
@@ -356,3 +357,27 @@ def test_the_series_of_an_image_is_named_in_the_case_file(folder):
     write_case(folder, ct_series=3)
     with pytest.raises(InputRefused):
         read_case(folder)  # that one shows no chest
+
+
+@pytest.mark.parametrize("label", [2, "nodule", "Nodule"])
+@pytest.mark.parametrize("kind", ["SEG", "RTSTRUCT"])
+def test_the_nodule_is_chosen_by_its_label(folder, kind, label):
+    """Of a lung that it lies in."""
+    lung, nodule = blob(grid_at(), (2, 9), (3, 15), (2, 14)), blob(grid_at(), (4, 6), (8, 10), (6, 9))
+    if kind == "SEG":
+        written(segmentation(grid_at(), {"lung": lung, "nodule": nodule}), folder / "nodule.dcm")
+    else:
+        outlines = {
+            "lung": [rectangle(grid_at(), (2, 9), (3, 15), k) for k in range(2, 14)],
+            "nodule": [rectangle(grid_at(), (4, 6), (8, 10), k) for k in range(6, 9)],
+        }
+        written(structures(outlines), folder / "nodule.dcm")
+    write_case(folder)
+    with pytest.raises(
+        InputRefused, match=r"holds 2 regions: 1 \(lung\) with 1008 voxels, 2 \(nodule\) with 12 voxels"
+    ):
+        read_case(folder)
+    write_case(folder, label)
+    case = read_case(folder)
+    assert case.nodule.mask is not None
+    assert_array_equal(case.nodule.mask.inside, nodule)
