@@ -16,9 +16,10 @@ import numpy as np
 
 from registration.volume import Array, Grid, Mask, Volume, axis_codes
 from vatsloc.errors import CaseError, InputRefused
-from vatsloc.formats.casefile import CaseFile, PleuralGas, Side, Triple, read_case_file
+from vatsloc.formats.casefile import CaseFile, PleuralGas, SeriesName, Side, Triple, read_case_file
+from vatsloc.formats.dicom.regions import holds_regions
 from vatsloc.formats.guard import reading
-from vatsloc.formats.images import files_behind, read_volume
+from vatsloc.formats.images import files_behind, read_volume_and_warnings, stated_frame
 from vatsloc.formats.markups import PointList, read_points
 from vatsloc.formats.meshes import Surface
 from vatsloc.frames import reorient
@@ -84,15 +85,17 @@ def read_case(folder: Path) -> Case:
     paths = _input_paths(folder, file)
     gravity = _gravity(file.side, file.setup.gravity_cbct)
     with ThreadPoolExecutor(max_workers=2) as pool:  # decompression and hashing release the interpreter lock
-        images = pool.map(_read_image, (paths["ct"], paths["cbct_inflated"], paths["cbct_deflated"]))
+        names = ("ct", "cbct_inflated", "cbct_deflated")
+        images = pool.map(lambda name: _read_image(paths[name], file.images.series(name)), names)
         digests = pool.map(sha256, paths.values())
-        (ct, ct_axes), (inflated, inflated_axes), (deflated, deflated_axes) = images
+        (ct, ct_axes, said), (inflated, inflated_axes, said_inflated), (deflated, deflated_axes, said_deflated) = images
         input_sha256 = dict(zip(paths, digests, strict=True))
     for name in ("cbct_inflated", "cbct_deflated"):
         _check_overlap(ct.grid, (inflated if name == "cbct_inflated" else deflated).grid, paths["ct"], paths[name])
     _check_overlap(inflated.grid, deflated.grid, paths["cbct_inflated"], paths["cbct_deflated"])
-    warnings: list[str] = []
-    source = NoduleSource(paths.get("nodule_mask"), file.nodule.label, paths.get("nodule_point"))
+    warnings = [*said, *said_inflated, *said_deflated]
+    frame = _frame_of_ct(paths, file)
+    source = NoduleSource(paths.get("nodule_mask"), file.nodule.label, paths.get("nodule_point"), frame)
     return Case(
         folder=folder,
         side=file.side,
@@ -102,7 +105,7 @@ def read_case(folder: Path) -> Case:
         nodule=read_nodule(source, ct.grid, warnings),
         gravity_ras=gravity,
         pleural_gas=file.setup.pleural_gas,
-        hints=_hints(file, paths, (ct.grid, inflated.grid, deflated.grid), warnings),
+        hints=_hints(file, paths, (ct.grid, inflated.grid, deflated.grid), frame, warnings),
         input_sha256=input_sha256,
         stored_axes={"ct": ct_axes, "cbct_inflated": inflated_axes, "cbct_deflated": deflated_axes},
         warnings=tuple(warnings),
@@ -166,8 +169,15 @@ def _gravity(side: Side, stated: Triple | None) -> Array:
     return gravity
 
 
-def _read_image(path: Path) -> tuple[Volume, str]:
-    volume = read_volume(path)
+def _frame_of_ct(paths: Mapping[str, Path], file: CaseFile) -> str:
+    """Frame of reference of a DICOM CT, where a region drawn in DICOM has to be compared with it; else ""."""
+    drawn = any(key in paths and holds_regions(paths[key]) for key in ("nodule_mask", "lung_mask_ct"))
+    return stated_frame(paths["ct"], file.images.ct_series) if drawn else ""
+
+
+def _read_image(path: Path, series: SeriesName | None) -> tuple[Volume, str, tuple[str, ...]]:
+    """The image, the order of its axes as stored, and warnings of its reader."""
+    volume, warnings = read_volume_and_warnings(path, series)
     size = np.array(volume.hu.shape) * volume.grid.spacing
     if not IMAGE_MM[0] <= size.max() <= IMAGE_MM[1]:
         raise InputRefused(
@@ -181,7 +191,7 @@ def _read_image(path: Path) -> tuple[Volume, str]:
             "export it with its rescale to HU."
         )
     hu, ras_from_ijk = reorient(volume.hu, volume.ras_from_ijk, AXES)
-    return Volume(np.ascontiguousarray(hu), ras_from_ijk), axis_codes(volume.ras_from_ijk)
+    return Volume(np.ascontiguousarray(hu), ras_from_ijk), axis_codes(volume.ras_from_ijk), warnings
 
 
 def _check_overlap(a: Grid, b: Grid, path_a: Path, path_b: Path) -> None:
@@ -202,7 +212,9 @@ def _share_inside(a: Grid, b: Grid) -> float:
     return float(inside_of(b, a.to_ras(ijk)).mean())
 
 
-def _hints(file: CaseFile, paths: Mapping[str, Path], grids: tuple[Grid, Grid, Grid], warnings: list[str]) -> Hints:
+def _hints(
+    file: CaseFile, paths: Mapping[str, Path], grids: tuple[Grid, Grid, Grid], frame: str, warnings: list[str]
+) -> Hints:
     ct, inflated, deflated = grids
     spines: list[Array | None] = []
     for key, point, grid in (
@@ -217,7 +229,7 @@ def _hints(file: CaseFile, paths: Mapping[str, Path], grids: tuple[Grid, Grid, G
     lung = surface = None
     if "lung_mask_ct" in paths:
         ask = "[hints] lung_label = ... in case.toml"
-        lung = mask_on(paths["lung_mask_ct"], ct, file.hints.lung_label, ask, warnings)
+        lung = mask_on(paths["lung_mask_ct"], ct, file.hints.lung_label, ask, warnings, frame)
     if "deflated_surface" in paths:
         surface = read_hint_surface(paths["deflated_surface"], deflated, warnings)
     return Hints(spines[0], spines[1], lung, surface)

@@ -46,11 +46,12 @@ class Nodule:
 @dataclass(frozen=True)
 class NoduleSource:
     """Files that say where the nodule is: a mask, of which `label` chooses a region where it holds several, a point, or
-    both."""
+    both. frame: of reference of the CT, "" where none is stated, for regions drawn in DICOM."""
 
     mask: Path | None = None
     label: Label | Sequence[Label] | None = None
     point: Path | None = None
+    frame: str = ""
 
 
 def read_nodule(source: NoduleSource, ct: Grid, warnings: list[str]) -> Nodule:
@@ -61,7 +62,7 @@ def read_nodule(source: NoduleSource, ct: Grid, warnings: list[str]) -> Nodule:
     """
     mask = centre = None
     if source.mask is not None:
-        on_ct = mask_on(source.mask, ct, source.label, "[nodule] label = ... in case.toml", warnings)
+        on_ct = mask_on(source.mask, ct, source.label, "[nodule] label = ... in case.toml", warnings, source.frame)
         mask = _largest_part(on_ct, source.mask, warnings)
         centre = ct.to_ras(np.argwhere(mask.inside).mean(axis=0))
         _check_nodule_size(mask, source.mask)
@@ -72,9 +73,11 @@ def read_nodule(source: NoduleSource, ct: Grid, warnings: list[str]) -> Nodule:
     return Nodule(centre, mask)
 
 
-def mask_on(path: Path, grid: Grid, label: Label | Sequence[Label] | None, ask: str, warnings: list[str]) -> Mask:
+def mask_on(
+    path: Path, grid: Grid, label: Label | Sequence[Label] | None, ask: str, warnings: list[str], frame: str = ""
+) -> Mask:
     """A region of a file on a grid, which it may reach beyond. Raises InputRefused when it lies outside or vanishes."""
-    mask = read_region(path, label, ask)
+    mask = read_region(path, label, ask, grid, frame)
     inside, ras_from_ijk = reorient(mask.inside, mask.ras_from_ijk, AXES)
     mask = Mask(np.ascontiguousarray(inside), ras_from_ijk)
     points = _some_voxels(mask)

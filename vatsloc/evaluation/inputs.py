@@ -98,7 +98,7 @@ def read_truth(case: Path) -> Truth:
         ("inflated", images.cbct_inflated, known.cbct_inflated),
         ("deflated", images.cbct_deflated, known.cbct_deflated),
     ):
-        volume = read_volume(case / file)
+        volume = read_volume(case / file, images.series(f"cbct_{image}"))
         if points is not None:
             _check_extent(points, file)
             _check_place(points, volume.grid, file)

@@ -38,6 +38,7 @@ def _file_name(name: str) -> str:
 
 
 FileName = Annotated[str, AfterValidator(_file_name)]
+SeriesName = Annotated[int, Field(strict=True)] | Annotated[str, Field(min_length=1)]
 
 
 def _label(value: Any) -> Any:
@@ -58,11 +59,20 @@ class _Table(BaseModel):
 
 
 class ImageFiles(_Table):
-    """Paths relative to the case folder."""
+    """Paths relative to the case folder. *_series: UID, number or description of the series to take in a DICOM folder
+    that holds several."""
 
     ct: FileName
     cbct_inflated: FileName
     cbct_deflated: FileName
+    ct_series: SeriesName | None = None
+    cbct_inflated_series: SeriesName | None = None
+    cbct_deflated_series: SeriesName | None = None
+
+    def series(self, image: str) -> SeriesName | None:
+        """What is stated of the image's series: "ct", "cbct_inflated" or "cbct_deflated"."""
+        stated: SeriesName | None = getattr(self, f"{image}_series")
+        return stated
 
 
 class NoduleFiles(_Table):

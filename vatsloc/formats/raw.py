@@ -37,13 +37,15 @@ class Segment:
 class RawImage:
     """Voxels as stored. values: (ni, nj, nk[, 1...]), or (ni, nj, nk, layers) of a segmentation whose segments overlap.
 
-    ras_from_ijk: (4, 4), mm; path: file or folder it came from; segments: what the file names, none in most formats.
+    ras_from_ijk: (4, 4), mm; path: file or folder it came from; segments: what the file names, none in most formats;
+    warnings: what its reader left out or doubts, a sentence each.
     """
 
     values: Array
     ras_from_ijk: Array
     path: Path
     segments: tuple[Segment, ...] = ()
+    warnings: tuple[str, ...] = ()
 
 
 def checked(image: RawImage, least_voxels: int = 2) -> RawImage:
