@@ -220,6 +220,7 @@ def test_kinds_are_told_apart(tmp_path):
     assert not holds_regions(written(ct_slice(np.eye(3), 0), tmp_path / "ct.dcm"))
     assert not holds_regions(tmp_path / "note.dcm")
     assert not holds_regions(tmp_path)
+    assert not holds_regions(tmp_path / ("x" * 300))
 
 
 OTHER = generate_uid()

@@ -29,7 +29,10 @@ MAX_SLICES = 10_000
 @guarded("file", "check its permissions")
 def holds_regions(path: Path) -> bool:
     """Whether a file is a DICOM Segmentation or RT Structure Set; False for folders and all other files."""
-    if not path.is_file():
+    try:
+        if not path.is_file():
+            return False
+    except (OSError, ValueError):  # a name that no file can have, which is refused where the file is read
         return False
     with path.open("rb") as file:
         if file.read(132)[128:] != b"DICM":
