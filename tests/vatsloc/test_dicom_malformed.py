@@ -17,9 +17,9 @@ from pydicom.dataelem import DataElement
 from pydicom.dataset import Dataset
 from pydicom.tag import BaseTag
 
+from tests.vatsloc.dicom_drawn import blob, grid, rectangle, segmentation, structures
 from tests.vatsloc.dicom_made import FRAME, NK, SLICE_MM, ct_slice, enhanced, save
 from tests.vatsloc.test_dicom_pixels import lut
-from tests.vatsloc.test_dicom_regions import OUTLINE, blob, grid, segmentation, structures
 from vatsloc.errors import InputRefused
 from vatsloc.formats.dicom.regions import read_regions
 from vatsloc.formats.images import read_volume
@@ -183,7 +183,7 @@ DRAWN = {
     "segmentation": segmentation(
         grid(), {"lung": blob(grid(), (7, 11), (1, 9), (1, 7)), "nodule": blob(grid(), (2, 5), (3, 6), (2, 4))}
     ),
-    "structures": structures(OUTLINE),
+    "structures": structures({"nodule": [rectangle(grid(), (2, 5), (3, 6), 2)]}),
 }
 WHERE_DRAWN = [(name, place) for name, ds in DRAWN.items() for place in places(ds)]
 
