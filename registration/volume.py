@@ -160,6 +160,12 @@ class Mask(_OnGrid):
         rim = np.argwhere(self.inside & ~ndimage.binary_erosion(self.inside))
         return float(np.linalg.norm(self.grid.to_ras(rim.astype(float)) - point_ras, axis=1).min(initial=np.inf))
 
+    def padded(self) -> Mask:
+        """The same region with one more voxel, outside it, on every side of the grid."""
+        affine = self.ras_from_ijk.copy()
+        affine[:3, 3] = self.grid.to_ras(np.full(3, -1.0))
+        return Mask(np.pad(self.inside, 1), affine)
+
     def part(self, cut: Cut) -> Mask:
         """The voxels of three slices."""
         return Mask(self.inside[cut], self.grid.part(cut).ras_from_ijk)

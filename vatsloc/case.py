@@ -13,33 +13,24 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy import ndimage
 
-from registration.images.resample import resample_mask
 from registration.volume import Array, Grid, Mask, Volume, axis_codes
 from vatsloc.errors import CaseError, InputRefused
-from vatsloc.formats.casefile import CaseFile, PleuralGas, Side, Triple, read_case_file
-from vatsloc.formats.images import files_behind, read_mask, read_volume
+from vatsloc.formats.casefile import CaseFile, PleuralGas, SeriesName, Side, Triple, read_case_file
+from vatsloc.formats.dicom.regions import holds_regions
+from vatsloc.formats.guard import reading
+from vatsloc.formats.images import files_behind, read_volume_and_warnings, stated_frame
 from vatsloc.formats.markups import PointList, read_points
-from vatsloc.formats.meshes import Surface, read_surface
+from vatsloc.formats.meshes import Surface
 from vatsloc.frames import reorient
+from vatsloc.marks import AXES, Nodule, NoduleSource, inside_of, mask_on, one_point, read_hint_surface, read_nodule
 
-AXES = "LPS"
 MIN_OVERLAP = 0.2
 """Share of the smaller image's box that must lie inside the other; headers promise poses within about 10 cm."""
 MAX_AIR_HU = -500.0
 """The lowest percent of voxels of a chest image in HU is air, far below this."""
-MAX_POINT_TO_MASK_MM = 10.0
-MAX_SPECK_SHARE = 0.1
-MIN_SURFACE_INSIDE = 0.9
-
-
-@dataclass(frozen=True)
-class Nodule:
-    """The target in the CT. centre_ras: (3,) mm; mask: on the CT's grid, or None when only a point is known."""
-
-    centre_ras: Array
-    mask: Mask | None
+IMAGE_MM = (60.0, 3000.0)
+"""Between these lies the longest side of any image of a chest, not of one in metres or micrometres."""
 
 
 @dataclass(frozen=True)
@@ -94,24 +85,27 @@ def read_case(folder: Path) -> Case:
     paths = _input_paths(folder, file)
     gravity = _gravity(file.side, file.setup.gravity_cbct)
     with ThreadPoolExecutor(max_workers=2) as pool:  # decompression and hashing release the interpreter lock
-        images = pool.map(_read_image, (paths["ct"], paths["cbct_inflated"], paths["cbct_deflated"]))
+        names = ("ct", "cbct_inflated", "cbct_deflated")
+        images = pool.map(lambda name: _read_image(paths[name], file.images.series(name)), names)
         digests = pool.map(sha256, paths.values())
-        (ct, ct_axes), (inflated, inflated_axes), (deflated, deflated_axes) = images
+        (ct, ct_axes, said), (inflated, inflated_axes, said_inflated), (deflated, deflated_axes, said_deflated) = images
         input_sha256 = dict(zip(paths, digests, strict=True))
     for name in ("cbct_inflated", "cbct_deflated"):
         _check_overlap(ct.grid, (inflated if name == "cbct_inflated" else deflated).grid, paths["ct"], paths[name])
     _check_overlap(inflated.grid, deflated.grid, paths["cbct_inflated"], paths["cbct_deflated"])
-    warnings: list[str] = []
+    warnings = [*said, *said_inflated, *said_deflated]
+    frame = _frame_of_ct(paths, file)
+    source = NoduleSource(paths.get("nodule_mask"), file.nodule.label, paths.get("nodule_point"), frame)
     return Case(
         folder=folder,
         side=file.side,
         ct=ct,
         cbct_inflated=inflated,
         cbct_deflated=deflated,
-        nodule=_nodule(paths, ct.grid, warnings),
+        nodule=read_nodule(source, ct.grid, warnings),
         gravity_ras=gravity,
         pleural_gas=file.setup.pleural_gas,
-        hints=_hints(file, paths, (ct.grid, inflated.grid, deflated.grid), warnings),
+        hints=_hints(file, paths, (ct.grid, inflated.grid, deflated.grid), frame, warnings),
         input_sha256=input_sha256,
         stored_axes={"ct": ct_axes, "cbct_inflated": inflated_axes, "cbct_deflated": deflated_axes},
         warnings=tuple(warnings),
@@ -129,7 +123,7 @@ def read_landmarks(folder: Path) -> Landmarks:
         for image in ("ct", "cbct_inflated", "cbct_deflated")
     }
     truth = {image: folder / "truth" / f"nodule_{image}.mrk.json" for image in ("cbct_inflated", "cbct_deflated")}
-    nodule = {image: _one_point(path) if path.exists() else None for image, path in truth.items()}
+    nodule = {image: one_point(path) if path.exists() else None for image, path in truth.items()}
     return Landmarks(**lists, nodule_inflated_ras=nodule["cbct_inflated"], nodule_deflated_ras=nodule["cbct_deflated"])
 
 
@@ -137,7 +131,7 @@ def sha256(path: Path) -> str:
     """Digest of a file, or of the digests of all files that an image path stands for."""
     digests = []
     for file in files_behind(path):
-        with file.open("rb") as stream:
+        with reading(file, "file"), file.open("rb") as stream:
             digests.append(hashlib.file_digest(stream, "sha256").hexdigest())
     return digests[0] if len(digests) == 1 else hashlib.sha256("".join(digests).encode()).hexdigest()
 
@@ -154,7 +148,9 @@ def _input_paths(folder: Path, file: CaseFile) -> dict[str, Path]:
     }
     paths = {key: folder / name for key, name in names.items() if name is not None}
     for key, path in paths.items():
-        if not path.exists():
+        with reading(path, "file", "correct case.toml", CaseError):
+            there = path.exists()
+        if not there:
             raise CaseError(f"{path} ({key} in case.toml) does not exist; put it there or correct case.toml.")
     return paths
 
@@ -173,8 +169,21 @@ def _gravity(side: Side, stated: Triple | None) -> Array:
     return gravity
 
 
-def _read_image(path: Path) -> tuple[Volume, str]:
-    volume = read_volume(path)
+def _frame_of_ct(paths: Mapping[str, Path], file: CaseFile) -> str:
+    """Frame of reference of a DICOM CT, where a region drawn in DICOM has to be compared with it; else ""."""
+    drawn = any(key in paths and holds_regions(paths[key]) for key in ("nodule_mask", "lung_mask_ct"))
+    return stated_frame(paths["ct"], file.images.ct_series) if drawn else ""
+
+
+def _read_image(path: Path, series: SeriesName | None) -> tuple[Volume, str, tuple[str, ...]]:
+    """The image, the order of its axes as stored, and warnings of its reader."""
+    volume, warnings = read_volume_and_warnings(path, series)
+    size = np.array(volume.hu.shape) * volume.grid.spacing
+    if not IMAGE_MM[0] <= size.max() <= IMAGE_MM[1]:
+        raise InputRefused(
+            f"{path} measures {' x '.join(f'{mm:.3g}' for mm in size)} mm, which no image of a chest does; "
+            "export it with its voxel size in millimetres."
+        )
     lowest = float(np.percentile(volume.hu[::4, ::4, ::4], 1))
     if lowest > MAX_AIR_HU:
         raise InputRefused(
@@ -182,7 +191,7 @@ def _read_image(path: Path) -> tuple[Volume, str]:
             "export it with its rescale to HU."
         )
     hu, ras_from_ijk = reorient(volume.hu, volume.ras_from_ijk, AXES)
-    return Volume(np.ascontiguousarray(hu), ras_from_ijk), axis_codes(volume.ras_from_ijk)
+    return Volume(np.ascontiguousarray(hu), ras_from_ijk), axis_codes(volume.ras_from_ijk), warnings
 
 
 def _check_overlap(a: Grid, b: Grid, path_a: Path, path_b: Path) -> None:
@@ -200,92 +209,29 @@ def _share_inside(a: Grid, b: Grid) -> float:
     """Share of a's box that lies inside b's."""
     fractions = (np.arange(16) + 0.5) / 16
     ijk = np.stack(np.meshgrid(*(fractions * n - 0.5 for n in a.shape), indexing="ij"), axis=-1)
-    return float(_inside(b, a.to_ras(ijk)).mean())
+    return float(inside_of(b, a.to_ras(ijk)).mean())
 
 
-def _inside(grid: Grid, points_ras: Array) -> Array:
-    ijk = grid.to_ijk(points_ras)
-    return np.asarray(((ijk >= -0.5) & (ijk <= np.array(grid.shape) - 0.5)).all(axis=-1))
-
-
-def _nodule(paths: Mapping[str, Path], ct: Grid, warnings: list[str]) -> Nodule:
-    mask = centre = None
-    if "nodule_mask" in paths:
-        mask = _largest_part(_mask_on(paths["nodule_mask"], ct), paths["nodule_mask"], warnings)
-        centre = ct.to_ras(np.argwhere(mask.inside).mean(axis=0))
-    if "nodule_point" in paths:
-        point = _one_point(paths["nodule_point"])
-        if not _inside(ct, point):
-            raise InputRefused(f"{paths['nodule_point']} lies outside the CT; save the point in the CT's frame.")
-        if mask is not None:
-            apart = np.linalg.norm(ct.to_ras(np.argwhere(mask.inside)) - point, axis=1).min()
-            if apart > MAX_POINT_TO_MASK_MM:
-                raise InputRefused(
-                    f"{paths['nodule_point']} lies {apart:.0f} mm off the nodule mask {paths['nodule_mask'].name}; "
-                    "keep the right one of the two."
-                )
-        centre = point
-    assert centre is not None  # the case file names at least one of them
-    return Nodule(centre, mask)
-
-
-def _mask_on(path: Path, grid: Grid) -> Mask:
-    """Mask of a file on the CT's grid."""
-    mask = read_mask(path)
-    inside, ras_from_ijk = reorient(mask.inside, mask.ras_from_ijk, AXES)
-    mask = Mask(np.ascontiguousarray(inside), ras_from_ijk)
-    if not _inside(grid, mask.grid.to_ras(np.argwhere(mask.inside).mean(axis=0))):
-        raise InputRefused(f"{path} lies outside the CT; draw the mask in the CT's frame.")
-    if not mask.grid.same_as(grid):
-        mask = resample_mask(mask, grid)
-        if not mask.inside.any():
-            raise InputRefused(
-                f"{path} is finer than the CT's voxels and falls between them; draw it on the CT's grid."
-            )
-    return mask
-
-
-def _largest_part(mask: Mask, path: Path, warnings: list[str]) -> Mask:
-    """The connected part that is the nodule; specks are dropped with a warning, a second nodule is refused."""
-    labels, n = ndimage.label(mask.inside, structure=np.ones((3, 3, 3)))
-    if n == 1:
-        return mask
-    sizes = np.bincount(labels.ravel())[1:]
-    largest = int(np.argmax(sizes))
-    others = int(sizes.sum() - sizes[largest])
-    if others > MAX_SPECK_SHARE * sizes[largest]:
-        raise InputRefused(
-            f"{path} shows {n} separate regions, the largest of {sizes[largest]} voxels and {others} in others; "
-            "keep one nodule per case."
-        )
-    warnings.append(f"{path.name}: {others} voxels apart from the nodule were left out.")
-    return Mask(labels == largest + 1, mask.ras_from_ijk)
-
-
-def _hints(file: CaseFile, paths: Mapping[str, Path], grids: tuple[Grid, Grid, Grid], warnings: list[str]) -> Hints:
+def _hints(
+    file: CaseFile, paths: Mapping[str, Path], grids: tuple[Grid, Grid, Grid], frame: str, warnings: list[str]
+) -> Hints:
     ct, inflated, deflated = grids
     spines: list[Array | None] = []
     for key, point, grid in (
         ("spine_ct", file.hints.spine_ct, ct),
         ("spine_cbct_inflated", file.hints.spine_cbct_inflated, inflated),
     ):
-        if point is not None and not _inside(grid, np.array(point)):
+        if point is not None and not inside_of(grid, np.array(point)):
             raise CaseError(
                 f"{key} = {list(point)} in case.toml lies outside its image; give RAS millimetres inside it."
             )
         spines.append(None if point is None else np.array(point))
-    lung = _mask_on(paths["lung_mask_ct"], ct) if "lung_mask_ct" in paths else None
-    surface = None
+    lung = surface = None
+    if "lung_mask_ct" in paths:
+        ask = "[hints] lung_label = ... in case.toml"
+        lung = mask_on(paths["lung_mask_ct"], ct, file.hints.lung_label, ask, warnings, frame)
     if "deflated_surface" in paths:
-        surface = read_surface(paths["deflated_surface"])
-        share = float(_inside(deflated, surface.points_ras).mean())
-        if share < MIN_SURFACE_INSIDE:
-            raise InputRefused(
-                f"{paths['deflated_surface']} has {100 * share:.0f} % of its points inside the deflated CBCT, "
-                f"{100 * MIN_SURFACE_INSIDE:.0f} % needed; save it in LPS millimetres of that image."
-            )
-        if not surface.frame_stated:
-            warnings.append(f"{paths['deflated_surface'].name} states no frame; LPS was taken.")
+        surface = read_hint_surface(paths["deflated_surface"], deflated, warnings)
     return Hints(spines[0], spines[1], lung, surface)
 
 
@@ -293,10 +239,3 @@ def _points_or_none(folder: Path, named: str | None, usual: str) -> PointList | 
     if named is not None:
         return read_points(folder / named)
     return read_points(folder / usual) if (folder / usual).exists() else None
-
-
-def _one_point(path: Path) -> Array:
-    points = read_points(path)
-    if len(points) != 1:
-        raise InputRefused(f"{path} holds {len(points)} points, one needed; keep the nodule's centre.")
-    return points.ras[0]

@@ -19,7 +19,7 @@ from registration.volume import Array
 from vatsloc.errors import CaseError, InputRefused
 from vatsloc.formats.casefile import FILE_NAME
 from vatsloc.formats.folder import whole_folder
-from vatsloc.formats.images import read_mask, read_volume
+from vatsloc.formats.images import read_region, read_volume
 from vatsloc.formats.markups import PointList, write_points
 from vatsloc.formats.nifti import write_mask, write_volume
 from vatsloc.imaging.hilum import find_hilum
@@ -99,7 +99,7 @@ def twin_spec(side: Side, name: str | None) -> PhantomSpec:
 def read_scan(ct: Path, side: Side, nodule: Path | None = None) -> Scan:
     """A chest CT with its lungs, spine and the root of the lung on `side`; raises InputRefused where it lacks one."""
     image = read_volume(ct)
-    given = None if nodule is None else read_mask(nodule)
+    given = None if nodule is None else read_region(nodule, ask="save the nodule alone")
     lungs = segment_lungs(image, side, given)
     hilum = find_hilum(lungs.of(side), lungs.airways, side)
     regions = {"right": to_region(lungs.right), "left": to_region(lungs.left)}

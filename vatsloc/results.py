@@ -37,7 +37,7 @@ RIGID_INFLATED_FROM_CT = "from-CT_to-CBCTinflated_mode-points_desc-rigid_xfm.tfm
 RIGID_CT_FROM_INFLATED = "from-CBCTinflated_to-CT_mode-image_desc-rigid_xfm.tfm"
 RIGID_DEFLATED_FROM_INFLATED = "from-CBCTinflated_to-CBCTdeflated_mode-points_desc-rigid_xfm.tfm"
 RIGID_INFLATED_FROM_DEFLATED = "from-CBCTdeflated_to-CBCTinflated_mode-image_desc-rigid_xfm.tfm"
-REPORT, SCENE = "report.html", "scene.mrml"
+REPORT, SCENE, SCENE_WITH_SCANS = "report.html", "scene.mrml", "scene_with_scans.mrml"
 RADIUS95 = "radius95_mm"
 """Of the nodes of `LUNG_DEFLATED`: how far off the tissue there may be, 95 %."""
 
@@ -63,8 +63,9 @@ OUTPUT_FILES = (
     RUN_FILE,
     REPORT,
     SCENE,
+    SCENE_WITH_SCANS,
 )
-"""What a finished results folder holds; report and scene are written by modules of their own into the same folder."""
+"""What a finished results folder holds; report and scenes are written by modules of their own into the same folder."""
 
 
 @dataclass(frozen=True)
@@ -124,7 +125,7 @@ class ResultData:
 
 
 def write_results(folder: Path, data: ResultData) -> None:
-    """Write every output file but report and scene into an existing folder, two files at a time."""
+    """Write every output file but report and scenes into an existing folder, two files at a time."""
     axes = data.stored_axes
     inflated, deflated = axes["cbct_inflated"], axes["cbct_deflated"]
     writes: list[Callable[[], None]] = [

@@ -1,4 +1,4 @@
-"""What the scene of a result shows in 3D Slicer: everything in the deflated CBCT's frame, as the spine places it."""
+"""What the scenes of a result show in 3D Slicer: everything in the deflated CBCT's frame, as the spine places it."""
 
 from __future__ import annotations
 
@@ -18,6 +18,8 @@ from vatsloc.results import (
     NODULE_DEFLATED,
     NODULE_INFLATED,
     NODULE_MASK,
+    SCENE,
+    SCENE_WITH_SCANS,
     ResultData,
 )
 
@@ -25,19 +27,28 @@ INFLATED, CT = "inflated CBCT to deflated CBCT (spine)", "CT to inflated CBCT (s
 GREY = "#bec8d7"
 
 
-def write_result_scene(path: Path, case: Path, folder: Path, data: ResultData) -> None:
-    """Write the scene of a result that will lie in `folder`, beside the images of the case folder `case`.
+def write_result_scenes(partial: Path, case: Path, folder: Path, data: ResultData) -> None:
+    """Write both scenes of a result that is filled as `partial` and will lie in `folder`, of the case folder `case`.
 
-    Images that are folders of DICOM slices are left out: a scene names files.
+    SCENE names files of the result alone, so that the folder can be moved; SCENE_WITH_SCANS shows the case's images
+    too, where they lie now. Images that are folders of DICOM slices are left out: a scene names files.
     """
-    own = "CT warped to the deflated CBCT"
     images = _images(case)
-    background = next((image.name for image in images if image.name == "deflated CBCT"), own)
-    items: list[Item] = [
+    own = _own(folder, data)
+    warped = "CT warped to the deflated CBCT"
+    left_out = ", ".join(f"{image.name} ({image.path.name})" for image in images) or "no scan is a file"
+    note = f"Left out, so that this folder can be moved: {left_out}; {SCENE_WITH_SCANS} shows the scans where they lay."
+    write_scene(partial / SCENE, own, folder, warped, warped, note)
+    background = next((image.name for image in images if image.name == "deflated CBCT"), warped)
+    write_scene(partial / SCENE_WITH_SCANS, [*own, *images], folder, background, warped)
+
+
+def _own(folder: Path, data: ResultData) -> list[Item]:
+    """What lies in the result itself."""
+    return [
         Frame(INFLATED, data.rigid_deflated_from_inflated),
         Frame(CT, data.rigid_inflated_from_ct, INFLATED),
-        *images,
-        VolumeFile(own, folder / CT_IN_DEFLATED),
+        VolumeFile("CT warped to the deflated CBCT", folder / CT_IN_DEFLATED),
         VolumeFile("CT warped to the inflated CBCT", folder / CT_IN_INFLATED, INFLATED),
         VolumeFile("nodule", folder / NODULE_MASK, label=True),
         ModelFile("deflated lung", folder / DEFLATED_STL, LUNG, 0.4),
@@ -48,7 +59,6 @@ def write_result_scene(path: Path, case: Path, folder: Path, data: ResultData) -
         FieldFile("CT to inflated CBCT", folder / CT_FROM_INFLATED),
         FieldFile("CT to deflated CBCT", folder / CT_FROM_DEFLATED),
     ]
-    write_scene(path, items, folder, background, own)
 
 
 def _images(case: Path) -> list[VolumeFile]:

@@ -12,6 +12,8 @@ from registration.volume import Array, Grid
 
 THREADS_FROM = 30_000
 CHUNKS = 16
+EDGE = 1e-4
+"""Voxels: as far outside an image a point still counts as on its edge, where the rounding of headers can put it."""
 
 
 class _Samples(NamedTuple):
@@ -26,9 +28,10 @@ def _values(voxels, points, fill, out, start, stop):
     ni, nj, nk = voxels.shape
     for n in range(start, stop):
         x, y, z = points[n, 0], points[n, 1], points[n, 2]
-        if not (0.0 <= x <= ni - 1 and 0.0 <= y <= nj - 1 and 0.0 <= z <= nk - 1):
+        if not (-EDGE <= x <= ni - 1 + EDGE and -EDGE <= y <= nj - 1 + EDGE and -EDGE <= z <= nk - 1 + EDGE):
             out[n] = fill
             continue
+        x, y, z = min(max(x, 0.0), ni - 1.0), min(max(y, 0.0), nj - 1.0), min(max(z, 0.0), nk - 1.0)
         i, j, k = lower(x, ni), lower(y, nj), lower(z, nk)
         out[n] = value(voxels, i, j, k, x - i, y - j, z - k)
 

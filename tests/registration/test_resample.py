@@ -114,3 +114,22 @@ def test_a_mask_holds_points_in_its_voxels_and_none_beyond_the_grid() -> None:
     mask = Mask(inside, np.array([[-2.0, 0, 0, 10], [0, 3, 0, 0], [0, 0, 1, -5], [0, 0, 0, 1]]))
     points = np.array([[8.0, 6, -4], [8.9, 7.4, -4.4], [9.1, 6, -4], [8, 6, -5], [8, 9.5, -4], [1000, 0, 0]])
     assert mask.holds(points).tolist() == [True, True, False, False, False, False]
+
+
+@pytest.mark.parametrize("rounding", [0.0, 1e-7, -1e-7, 5e-5])
+def test_a_part_of_an_image_keeps_its_faces_wherever_rounding_puts_its_corner(rounding: float) -> None:
+    whole = Volume(np.arange(1.0, 217.0, dtype=np.float32).reshape(6, 6, 6), np.diag([0.7, 0.7, 1.25, 1.0]))
+    part = whole.part((slice(1, 4),) * 3)
+    affine = part.ras_from_ijk.copy()
+    affine[:3, 3] += rounding
+    target = Grid((6, 6, 6), whole.ras_from_ijk)
+    back = resample(Volume(part.hu, affine), target, fill=-1000.0)
+    assert_allclose(back.hu[1:4, 1:4, 1:4], part.hu, atol=5e-3)
+    assert (np.delete(back.hu, slice(1, 4), axis=0) == -1000).all()
+
+
+def test_a_padded_mask_is_the_same_region_with_room_around_it() -> None:
+    mask = Mask(np.ones((2, 3, 4), dtype=bool), np.array([[-2.0, 0, 0, 10], [0, 3, 0, 0], [0, 0, 1, -5], [0, 0, 0, 1]]))
+    padded = mask.padded()
+    assert padded.inside.shape == (4, 5, 6)
+    assert_allclose(padded.grid.to_ras(np.argwhere(padded.inside)), mask.grid.to_ras(np.argwhere(mask.inside)))

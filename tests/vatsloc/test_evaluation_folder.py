@@ -258,3 +258,66 @@ def test_transform_that_is_not_rigid_is_refused(folders):
     path.write_text(path.read_text().replace("Parameters: 0.99", "Parameters: 1.99"))
     with pytest.raises(InputRefused, match="no rigid transform"):
         evaluate_case(case, result)
+
+
+def rewritten(path, change):
+    """A point list whose JSON was changed in place."""
+    content = json.loads(path.read_text())
+    change(content["markups"][0]["controlPoints"])
+    path.write_text(json.dumps(content))
+
+
+def test_landmarks_never_placed_are_left_out_and_said(folders):
+    case, result = folders
+    rewritten(case / "landmarks_ct.mrk.json", lambda points: points[4].update(positionStatus="undefined"))
+    scores = evaluate_case(case, result)
+    assert scores["phase1"]["n"] == len(CT) - 1
+    assert "1 label(s) without a counterpart were left out: L4." in scores["warnings"]
+
+
+@pytest.mark.parametrize(
+    ("image", "scale", "shift", "sentence"),
+    [
+        ("ct", 1e-3, 0.0, r"12 landmarks of ct\.nii\.gz span 0\.03 x 0\.03 x 0\.045 mm, which no lung does; save them"),
+        (
+            "cbct_inflated",
+            1e-3,
+            0.0,
+            r"12 landmarks of cbct_inflated\.nii\.gz span 0\.0\d+ x .* mm, which no lung does",
+        ),
+        (
+            "cbct_inflated",
+            1.0,
+            400.0,
+            r"landmarks of cbct_inflated\.nii\.gz lie 594 mm beyond it, 150 mm allowed; save",
+        ),
+    ],
+)
+def test_landmarks_of_another_size_or_place_are_refused(folders, image, scale, shift, sentence):
+    case, result = folders
+
+    def change(points):
+        for point in points:
+            point["position"] = [scale * c + shift for c in point["position"]]
+
+    rewritten(case / f"landmarks_{image}.mrk.json", change)
+    with pytest.raises(InputRefused, match=sentence):
+        evaluate_case(case, result)
+
+
+@pytest.mark.parametrize(
+    "broken",
+    [
+        {"nodule_ellipsoid95_mm": "large"},
+        {"nodule_ellipsoid95_mm": [1, 2]},
+        {"nodule_ellipsoid95_mm": 3},
+        {"nodule_ellipsoid95_axes_lps": [[1, 0, 0]]},
+        {"input_sha256": ["a"]},
+    ],
+)
+def test_a_record_with_wrong_values_is_refused(folders, broken):
+    case, result = folders
+    run = json.loads((result / "run.json").read_text())
+    (result / "run.json").write_text(json.dumps(run | broken))
+    with pytest.raises(InputRefused, match=r"not a readable result of localize .*; run localize again"):
+        evaluate_case(case, result)

@@ -350,6 +350,12 @@ def test_nrrd_without_space_is_refused(tmp_path):
         ({"ElementDataFile": "slice%03d.raw 1 6 1"}, "slice by slice"),
         ({"DistanceUnits": "um"}, "in um, not mm"),
         ({"NDims": "2"}, "has 2 axes"),
+        ({"NDims": "3.5"}, "NDims = 3.5, whole numbers needed"),
+        ({"ElementSpacing": "0,5 1,5 2"}, "ElementSpacing = 0,5 1,5 2, 3 numbers needed"),
+        ({"ElementSpacing": "-0.5 1.5 2"}, "ElementSpacing = -0.5 1.5 2, sizes above 0 needed"),
+        ({"TransformMatrix": "0.5 0 0 0 1.5 0 0 0 2"}, "axes of length 0.5 x 1.5 x 2, 1 needed, beside ElementSpacing"),
+        ({"BinaryDataByteOrderMSB": ""}, "BinaryDataByteOrderMSB = nothing, True or False needed"),
+        ({"ElementNumberOfChannels": "one"}, "ElementNumberOfChannels = one, 1 numbers needed"),
     ],
 )
 def test_bad_metaimage_is_refused(tmp_path, changes, sentence):
@@ -402,3 +408,62 @@ def test_mask_takes_labels_and_probabilities_from_one_half(tmp_path):
     values[0, 0, :4] = [0.4, 0.5, 1, 255]
     write_nii(tmp_path / "mask.nii", values, np.eye(4))
     assert np.argwhere(read_mask(tmp_path / "mask.nii").inside).tolist() == [[0, 0, 1], [0, 0, 2], [0, 0, 3]]
+
+
+@pytest.mark.parametrize(("header_size", "before"), [("7", b"foreign"), ("-1", b"whatever precedes"), ("0", b"")])
+def test_mhd_may_name_a_file_with_a_header_of_its_own(tmp_path, header_size, before):
+    grid = Grid(SHAPE, affine_of("LPS"))
+    values = hu_at(grid.points())
+    (tmp_path / "ct.raw").write_bytes(before + values.tobytes(order="F"))
+    changes = {"ElementDataFile": "ct.raw", "HeaderSize": header_size}
+    (tmp_path / "ct.mhd").write_text(metaimage_header(values, grid.ras_from_ijk, **changes))
+    check_ramp(read_volume(tmp_path / "ct.mhd"), "LPS")
+
+
+def test_nifti_whose_voxel_size_contradicts_its_matrix_is_refused(tmp_path):
+    """The sform says 0.5 x 1.5 x 2 mm, which is read; pixdim says 1 x 1 x 1, which other programs would take."""
+    image = nibabel.Nifti1Image(hu_at(Grid(SHAPE, np.eye(4)).points()), None)
+    image.set_sform(affine_of("LPS"), code=1)
+    nibabel.save(image, tmp_path / "ct.nii")
+    sentence = r"two voxel sizes: 1 x 1 x 1 mm as pixdim, 0\.5 x 1\.5 x 2 mm by its matrix; programs differ in which"
+    with pytest.raises(InputRefused, match=sentence):
+        read_volume(tmp_path / "ct.nii")
+
+
+@pytest.mark.parametrize("size", [0.0, -1.5, np.nan, np.inf])
+def test_nifti_voxel_sizes_that_the_library_would_mend_are_refused(tmp_path, size):
+    grid = Grid(SHAPE, affine_of("LPS"))
+    write_nii(tmp_path / "ct.nii", hu_at(grid.points()), grid.ras_from_ijk)
+    data = bytearray((tmp_path / "ct.nii").read_bytes())
+    data[84:88] = np.float32(size).tobytes()  # pixdim[2]
+    (tmp_path / "ct.nii").write_bytes(bytes(data))
+    with pytest.raises(InputRefused, match=r"has voxels of 0\.5 x .* x 2 mm \(pixdim\); export it with its voxel size"):
+        read_volume(tmp_path / "ct.nii")
+
+
+def test_nifti_that_holds_more_than_it_states_is_refused(tmp_path):
+    """Four of the five planes along j would be read with rows shifted."""
+    grid = Grid(SHAPE, affine_of("LPS"))
+    write_nii(tmp_path / "ct.nii", hu_at(grid.points()), grid.ras_from_ijk)
+    data = bytearray((tmp_path / "ct.nii").read_bytes())
+    data[44:46] = np.int16(4).tobytes()  # dim[2]
+    (tmp_path / "ct.nii").write_bytes(bytes(data))
+    with pytest.raises(InputRefused, match="holds 480 bytes of voxels, 384 needed for 4 x 4 x 6"):
+        read_volume(tmp_path / "ct.nii")
+
+
+def test_nrrd_spacings_that_contradict_the_directions_are_refused(tmp_path):
+    grid = Grid(SHAPE, affine_of("LPS"))
+    write_nrrd(tmp_path / "same.nrrd", hu_at(grid.points()), grid.ras_from_ijk, spacings=[0.5, 1.5, 2.0])
+    check_ramp(read_volume(tmp_path / "same.nrrd"), "LPS")
+    write_nrrd(tmp_path / "ct.nrrd", hu_at(grid.points()), grid.ras_from_ijk, spacings=[0.5, 0.5, 2.0])
+    with pytest.raises(InputRefused, match=r"0\.5 x 0\.5 x 2 mm as spacings, 0\.5 x 1\.5 x 2 mm by its matrix"):
+        read_volume(tmp_path / "ct.nrrd")
+
+
+def test_values_beyond_single_precision_are_refused(tmp_path):
+    values = np.full(SHAPE, 1e300)
+    values[0] = 0
+    write_nii(tmp_path / "ct.nii", values, affine_of("LPS"))
+    with pytest.raises(InputRefused, match="values beyond single precision; export it in Hounsfield units"):
+        read_volume(tmp_path / "ct.nii")

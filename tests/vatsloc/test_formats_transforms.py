@@ -86,7 +86,7 @@ def test_versor(tmp_path):
     [
         ("BSplineTransform_double_3_3", [0] * 12, [0, 0, 0], "holds a BSplineTransform_double_3_3; export a rigid"),
         ("AffineTransform_double_3_3", [1] * 11, [0, 0, 0], "11 parameters and 3 fixed ones"),
-        ("AffineTransform_double_3_3", [1] * 5, [0, 0, 0], "unreadable parameters"),
+        ("AffineTransform_double_3_3", [1] * 5, [0, 0, 0], "5 parameters and 3 fixed ones"),
         ("AffineTransform_double_3_3", ["x"] * 12, [0, 0, 0], "unreadable parameters"),
         ("AffineTransform_double_3_3", ["nan"] * 12, [0, 0, 0], "12 parameters"),
         ("Euler3DTransform_double_3_3", [0] * 6, [0], "6 parameters and 1 fixed ones"),

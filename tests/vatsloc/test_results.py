@@ -22,6 +22,7 @@ from vatsloc.results import (
     OUTPUT_FILES,
     REPORT,
     SCENE,
+    SCENE_WITH_SCANS,
     ResultData,
     RunRecord,
     read_run,
@@ -91,7 +92,7 @@ def result() -> ResultData:
 def test_output_set_is_complete_and_a_result(tmp_path):
     with whole_folder(tmp_path / "out", expected=OUTPUT_FILES) as folder:
         write_results(folder, result())
-        for name in (REPORT, SCENE):  # modules of their own write these two
+        for name in (REPORT, SCENE, SCENE_WITH_SCANS):  # modules of their own write these
             (folder / name).write_text("<html></html>")
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == sorted(OUTPUT_FILES)
     assert is_result(tmp_path / "out")
@@ -114,7 +115,7 @@ def test_same_data_give_the_same_bytes(tmp_path):
         (tmp_path / name).mkdir()
         write_results(tmp_path / name, result())
     for name in OUTPUT_FILES:
-        if name not in (REPORT, SCENE):
+        if name not in (REPORT, SCENE, SCENE_WITH_SCANS):
             assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes()
 
 

@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 from tests.vatsloc.test_results import result
 from vatsloc.formats.markups import read_points
 from vatsloc.formats.scene import Frame, VolumeFile, write_scene
-from vatsloc.results import NODULE_DEFLATED, SCENE, ResultData, write_results
-from vatsloc.scene import write_result_scene
+from vatsloc.results import NODULE_DEFLATED, SCENE, SCENE_WITH_SCANS, ResultData, write_results
+from vatsloc.scene import write_result_scenes
 
 IMAGES = {"ct": "the ct/slices", "cbct_inflated": "cbct inflated.nii.gz", "cbct_deflated": "cbct_50%.nii.gz"}
 
@@ -33,13 +33,13 @@ def written(tmp_path: Path) -> tuple[Path, ResultData]:
     (case / "case.toml").write_text(f'side = "right"\n[images]\n{lines}\n[nodule]\nmask = "n.nii.gz"\n')
     data = result()
     write_results(folder, data)
-    write_result_scene(folder / SCENE, case, folder, data)
+    write_result_scenes(folder, case, folder, data)
     return folder, data
 
 
 def nodes(path: Path) -> dict[str, ET.Element]:
     """Nodes of a scene by id."""
-    root = ET.parse(path).getroot()
+    root = ET.parse(path).getroot()  # comments are left out by the parser
     assert root.tag == "MRML"
     found = {node.attrib["id"]: node for node in root}
     assert len(found) == len(list(root))
@@ -65,9 +65,13 @@ def named(scene: dict[str, ET.Element], name: str) -> ET.Element:
     return found
 
 
+def named_files(path: Path) -> list[str]:
+    return [unquote(node.attrib["fileName"]) for node in nodes(path).values() if "fileName" in node.attrib]
+
+
 def test_every_file_is_there_relative_to_the_scene(written: tuple[Path, ResultData]) -> None:
     folder, _ = written
-    files = [unquote(node.attrib["fileName"]) for node in nodes(folder / SCENE).values() if "fileName" in node.attrib]
+    files = named_files(folder / SCENE_WITH_SCANS)
     assert len(files) == 2 + 10  # of the case and of the result
     assert "../../a case/cbct_50%.nii.gz" in files
     for file in files:
@@ -75,8 +79,24 @@ def test_every_file_is_there_relative_to_the_scene(written: tuple[Path, ResultDa
         assert (folder / file).is_file(), file
 
 
+def test_a_result_that_is_moved_alone_still_opens(written: tuple[Path, ResultData], tmp_path: Path) -> None:
+    """The scene names files of the result alone, shows one of them, and says what it leaves out."""
+    folder, _ = written
+    moved = tmp_path / "elsewhere" / "deep" / "result"
+    moved.parent.mkdir(parents=True)
+    folder.rename(moved)
+    files = named_files(moved / SCENE)
+    assert len(files) == 10
+    assert all((moved / file).is_file() and "/" not in file for file in files)
+    scene = nodes(moved / SCENE)
+    shown = scene["vtkMRMLSliceCompositeNodeRed"].attrib["backgroundVolumeID"]
+    assert scene[shown].attrib["name"] == "CT warped to the deflated CBCT"
+    text = (moved / SCENE).read_text(encoding="utf-8")
+    assert "<!-- Left out, so that this folder can be moved: deflated CBCT (cbct_50%.nii.gz), inflated CBCT" in text
+
+
 def test_every_node_referred_to_is_there_and_a_ct_of_slices_is_left_out(written: tuple[Path, ResultData]) -> None:
-    scene = nodes(written[0] / SCENE)
+    scene = nodes(written[0] / SCENE_WITH_SCANS)
     for node in scene.values():
         for identity in referred(node).values():
             assert identity in scene
@@ -90,7 +110,7 @@ def test_every_node_referred_to_is_there_and_a_ct_of_slices_is_left_out(written:
 
 def test_the_inflated_scan_is_carried_to_the_deflated_one_in_ras(written: tuple[Path, ResultData]) -> None:
     folder, data = written
-    scene = nodes(folder / SCENE)
+    scene = nodes(folder / SCENE_WITH_SCANS)
     assert_allclose(to_world(scene, named(scene, "inflated CBCT")), data.rigid_deflated_from_inflated, atol=1e-12)
     carried = to_world(scene, named(scene, "nodule, inflated")) @ [*data.nodule_inflated_ras, 1]
     expected = data.rigid_deflated_from_inflated @ [*data.nodule_inflated_ras, 1]

@@ -15,29 +15,37 @@ from vatsloc.workflow.check import Checks
 from vatsloc.workflow.gates import at_most
 
 NODES = np.random.default_rng(3).normal(size=(400, 3)) * [40, 50, 60] + [10, 20, 30]
+BEFORE = NODES + np.array([0.0, 30.0, 5.0])
 
 
 @pytest.mark.parametrize("mm", [5, 10, 15])
 def test_a_shift_moves_every_node_alike(mm: int) -> None:
-    moved = FAULTS[f"shift {mm} mm"](NODES, np.random.default_rng(0)) - NODES
+    moved = FAULTS[f"shift {mm} mm"](BEFORE, NODES, np.random.default_rng(0)) - NODES
     assert_allclose(moved, np.broadcast_to(moved[0], moved.shape), atol=1e-12)
     assert np.linalg.norm(moved[0]) == pytest.approx(mm)
 
 
 def test_a_turn_keeps_shape_and_middle() -> None:
-    moved = FAULTS["turn 5 degrees"](NODES, np.random.default_rng(0))
+    moved = FAULTS["turn 5 degrees"](BEFORE, NODES, np.random.default_rng(0))
     assert_allclose(moved.mean(axis=0), NODES.mean(axis=0), atol=1e-9)
     assert_allclose(np.linalg.norm(moved[0] - moved[1]), np.linalg.norm(NODES[0] - NODES[1]))
     assert np.linalg.norm(moved - NODES, axis=1).max() > 3
 
 
 def test_a_lobe_is_a_part_and_shuffled_nodes_are_the_same_ones() -> None:
-    off = np.linalg.norm(FAULTS["one lobe off 10 mm"](NODES, np.random.default_rng(0)) - NODES, axis=1)
+    off = np.linalg.norm(FAULTS["one lobe off 10 mm"](BEFORE, NODES, np.random.default_rng(0)) - NODES, axis=1)
     assert (off > 0).mean() == pytest.approx(LOBE_SHARE, abs=0.01)
     assert off.max() == pytest.approx(LOBE_MM)
-    mixed = FAULTS["nodes in another order"](NODES, np.random.default_rng(0))
+    mixed = FAULTS["nodes in another order"](BEFORE, NODES, np.random.default_rng(0))
     assert_allclose(np.sort(mixed, axis=0), np.sort(NODES, axis=0))
     assert np.linalg.norm(mixed - NODES, axis=1).mean() > 10
+
+
+def test_an_exchange_of_sides_mirrors_and_a_stale_state_is_the_one_before() -> None:
+    mirrored = FAULTS["left and right exchanged"](BEFORE, NODES, np.random.default_rng(0))
+    middle = NODES.mean(axis=0)
+    assert_allclose((mirrored - middle) * [-1, 1, 1], NODES - middle, atol=1e-9)
+    assert_allclose(FAULTS["stale state: not collapsed"](BEFORE, NODES, np.random.default_rng(0)), BEFORE)
 
 
 def answer(**parts: object) -> Any:

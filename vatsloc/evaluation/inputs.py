@@ -11,7 +11,7 @@ import numpy as np
 from poro.mesh import TetMesh, closest_points
 from registration.maps.field import DisplacementField
 from registration.maps.rigid import RigidTransform
-from registration.volume import Array, Mask
+from registration.volume import Array, Grid, Mask
 from vatsloc.case import Landmarks, read_landmarks, sha256
 from vatsloc.errors import CaseError, InputRefused
 from vatsloc.evaluation.landmarks import LandmarkTriples, match
@@ -19,8 +19,9 @@ from vatsloc.evaluation.tre import RunMaps
 from vatsloc.formats.casefile import read_case_file
 from vatsloc.formats.fields import read_field
 from vatsloc.formats.folder import RUN_FILE, is_result
+from vatsloc.formats.guard import reading
 from vatsloc.formats.images import read_volume
-from vatsloc.formats.markups import read_points
+from vatsloc.formats.markups import PointList, read_points
 from vatsloc.formats.meshes import read_vtu
 from vatsloc.formats.transforms import read_tfm
 from vatsloc.imaging.cbct import field_of_view
@@ -40,6 +41,10 @@ from vatsloc.results import (
 )
 
 DENSE_FILE = "dense_ras_mm.csv"
+LANDMARKS_MM = (3.0, 800.0)
+"""Between these lies the diagonal of three landmarks or more of one lung."""
+MAX_BEYOND_MM = 150.0
+"""How far beyond a small image the middle of a lung's landmarks may lie."""
 
 
 @dataclass(frozen=True)
@@ -87,20 +92,47 @@ def read_truth(case: Path) -> Truth:
         )
     triples = match(known.ct, known.cbct_inflated, known.cbct_deflated)
     images = read_case_file(case).images
-    seen = {
-        "inflated": field_of_view(read_volume(case / images.cbct_inflated)).mask,
-        "deflated": field_of_view(read_volume(case / images.cbct_deflated)).mask,
-    }
+    _check_extent(known.ct, images.ct)
+    seen: dict[str, Mask] = {}
+    for image, file, points in (
+        ("inflated", images.cbct_inflated, known.cbct_inflated),
+        ("deflated", images.cbct_deflated, known.cbct_deflated),
+    ):
+        volume = read_volume(case / file, images.series(f"cbct_{image}"))
+        if points is not None:
+            _check_extent(points, file)
+            _check_place(points, volume.grid, file)
+        seen[image] = field_of_view(volume).mask
     return Truth(triples, known, seen, _dense(case / "truth" / DENSE_FILE))
+
+
+def _check_extent(points: PointList, image: str) -> None:
+    """Refuse landmarks that span what no lung does, as those in metres."""
+    extent = np.ptp(points.ras, axis=0)
+    if len(points) > 2 and not LANDMARKS_MM[0] <= float(np.linalg.norm(extent)) <= LANDMARKS_MM[1]:
+        raise InputRefused(
+            f"the {len(points)} landmarks of {image} span {' x '.join(f'{mm:.3g}' for mm in extent)} mm, "
+            "which no lung does; save them in millimetres."
+        )
+
+
+def _check_place(points: PointList, grid: Grid, image: str) -> None:
+    """Refuse landmarks that lie far from their image, as those in another frame."""
+    ijk = grid.to_ijk(np.median(points.ras, axis=0))
+    beyond = float(np.linalg.norm(np.maximum(np.maximum(-ijk, ijk - np.array(grid.shape) + 1), 0) * grid.spacing))
+    if beyond > MAX_BEYOND_MM:
+        raise InputRefused(
+            f"the landmarks of {image} lie {beyond:.0f} mm beyond it, {MAX_BEYOND_MM:.0f} mm allowed; "
+            "save them in that image's frame."
+        )
 
 
 def _dense(path: Path) -> Array | None:
     if not path.is_file():
         return None
-    try:
-        table = np.loadtxt(path, delimiter=",", skiprows=1, ndmin=2)
-    except ValueError as error:
-        raise InputRefused(f"{path} is not a table of numbers ({error}); make the phantom again.") from error
+    with reading(path, "table of numbers", "make the phantom again"):
+        rows = [line for line in path.read_text(encoding="utf-8-sig").splitlines()[1:] if line.strip()]
+        table = np.array([[float(value) for value in row.split(",")] for row in rows], ndmin=2)
     if table.shape[1] != 9 or not np.isfinite(table).all():
         raise InputRefused(f"{path} must hold 9 finite numbers a row (CT, inflated, deflated); make the phantom again.")
     return table.reshape(-1, 3, 3)
@@ -112,6 +144,13 @@ def read_result(folder: Path) -> Result:
         raise CaseError(
             f"{folder} is not a result of localize (no {RUN_FILE} of vatsloc); give the folder that localize wrote."
         )
+    with reading(folder, "result of localize", "run localize again"):
+        return _result(folder)
+
+
+def _result(folder: Path) -> Result:
+    run = read_run(folder)
+    _check_record(run)
     ct, inflated, deflated = (read_vtu(folder / name) for name in (LUNG_CT, LUNG_INFLATED, LUNG_DEFLATED))
     if not (np.array_equal(ct.tets, inflated.tets) and np.array_equal(inflated.tets, deflated.tets)):
         raise InputRefused(f"the lungs in {folder} have different tetrahedra; run localize again.")
@@ -122,7 +161,7 @@ def read_result(folder: Path) -> Result:
         _rigid(folder / RIGID_DEFLATED_FROM_INFLATED),
     )
     return Result(
-        run=read_run(folder),
+        run=run,
         maps=RunMaps(
             rigid_inf_from_ct=rigid_inf_from_ct,
             rigid_def_from_ct=rigid_def_from_inf @ rigid_inf_from_ct,
@@ -138,6 +177,16 @@ def read_result(folder: Path) -> Result:
         nodule_deflated_ras=read_points(folder / NODULE_DEFLATED).ras[0],
         radius95_mm=deflated.point_data.get(RADIUS95),
     )
+
+
+def _check_record(run: dict[str, Any]) -> None:
+    """Raise ValueError or TypeError unless what scores are made of has its shape; null stands for what is not known."""
+    np.array([v for v in run.get("nodule_ellipsoid95_mm") or () if v is not None], dtype=float)
+    directions = run.get("nodule_ellipsoid95_axes_lps")
+    if directions is not None and np.array(directions, dtype=float).shape != (3, 3):
+        raise ValueError("run.json holds no three directions of the ellipsoid")
+    if len(run.get("nodule_ellipsoid95_mm") or (0, 0, 0)) != 3 or not isinstance(run.get("input_sha256", {}), dict):
+        raise ValueError("run.json holds no three semi-axes, or no digests of the inputs")
 
 
 def check_same_case(case: Path, folder: Path, run: dict[str, Any]) -> None:

@@ -28,7 +28,8 @@ class LandmarkTriples:
 
 
 def match(ct: PointList, inflated: PointList | None, deflated: PointList | None) -> LandmarkTriples:
-    """Landmarks of three images side by side, in the CT's order. `unmatched`: labels that no pair could be made of.
+    """Landmarks of three images side by side, in the CT's order. `unmatched`: labels that no pair could be made of,
+    among them those of points that were never placed.
 
     Raises CaseError for a label used twice, and when no label of the CT occurs in either CBCT.
     """
@@ -43,7 +44,8 @@ def match(ct: PointList, inflated: PointList | None, deflated: PointList | None)
             f"no landmark label of the CT occurs in a CBCT ({'; '.join(seen)}); "
             "give the same point the same label in every file."
         )
-    everything = dict.fromkeys([*in_ct, *in_inf, *in_def])
+    unplaced = [label for points in (ct, inflated, deflated) if points is not None for label in points.unplaced]
+    everything = dict.fromkeys([*in_ct, *in_inf, *in_def, *unplaced])
     nowhere = np.full(3, np.nan)
     a, b, c = (np.array([points.get(label, nowhere) for label in labels]) for points in by_image)
     return LandmarkTriples(labels, a, b, c, unmatched=tuple(x for x in everything if x not in labels))

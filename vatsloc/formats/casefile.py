@@ -7,9 +7,19 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
 
 from vatsloc.errors import CaseError
+from vatsloc.formats.guard import reading
 
 FILE_NAME = "case.toml"
 GRAVITY_LENGTH_TOLERANCE = 0.05
@@ -17,9 +27,31 @@ GRAVITY_LENGTH_TOLERANCE = 0.05
 
 Side = Literal["right", "left"]
 PleuralGas = Literal["air", "co2"]
-Coordinate = Annotated[float, Field(allow_inf_nan=False)]
+Coordinate = Annotated[float, Field(allow_inf_nan=False, strict=True)]
 Triple = tuple[Coordinate, Coordinate, Coordinate]
-FileName = Annotated[str, Field(min_length=1)]
+
+
+def _file_name(name: str) -> str:
+    if not name.strip() or not name.isprintable() or max(len(part.encode()) for part in name.split("/")) > 255:
+        raise ValueError(f"= {name[:80]!r} is no file name; give a path relative to the case folder")
+    return name
+
+
+FileName = Annotated[str, AfterValidator(_file_name)]
+SeriesName = Annotated[int, Field(strict=True)] | Annotated[str, Field(min_length=1)]
+
+
+def _label(value: Any) -> Any:
+    one = value if isinstance(value, list) else [value]
+    numbers = [isinstance(v, int) and not isinstance(v, bool) and v > 0 for v in one]
+    names = [isinstance(v, str) and bool(v.strip()) for v in one]
+    if not one or not all(a or b for a, b in zip(numbers, names, strict=True)):
+        raise ValueError(f"= {value!r} is no label; give the label's number, from 1, or the segment's name")
+    return tuple(one)
+
+
+Labels = Annotated[tuple[int | str, ...], BeforeValidator(_label)]
+"""Numbers or segments' names; a single one may stand without brackets."""
 
 
 class _Table(BaseModel):
@@ -27,21 +59,35 @@ class _Table(BaseModel):
 
 
 class ImageFiles(_Table):
-    """Paths relative to the case folder."""
+    """Paths relative to the case folder. *_series: UID, number or description of the series to take in a DICOM folder
+    that holds several."""
 
     ct: FileName
     cbct_inflated: FileName
     cbct_deflated: FileName
+    ct_series: SeriesName | None = None
+    cbct_inflated_series: SeriesName | None = None
+    cbct_deflated_series: SeriesName | None = None
+
+    def series(self, image: str) -> SeriesName | None:
+        """What is stated of the image's series: "ct", "cbct_inflated" or "cbct_deflated"."""
+        stated: SeriesName | None = getattr(self, f"{image}_series")
+        return stated
 
 
 class NoduleFiles(_Table):
-    """A mask or a point in the CT frame, or both."""
+    """A mask or a point in the CT frame, or both. label: which region of the mask, where it holds several."""
 
     mask: FileName | None = None
     point: FileName | None = None
+    label: Labels | None = None
 
     @model_validator(mode="after")
     def _at_least_one(self) -> NoduleFiles:
+        if self.label is not None and self.mask is None:
+            raise ValueError("has a label but no mask; add the mask that it chooses from, or remove label")
+        if self.label is not None and len(self.label) > 1:
+            raise ValueError(f"has {len(self.label)} labels; keep one nodule per case")
         if self.mask is None and self.point is None:
             raise ValueError('names neither mask nor point; add mask = "nodule.nii.gz" or point = "nodule_ct.mrk.json"')
         return self
@@ -64,11 +110,13 @@ class Setup(_Table):
 
 
 class HintValues(_Table):
-    """What a user may give by hand. spine_*: RAS mm, the same vertebra in both images."""
+    """What a user may give by hand. spine_*: RAS mm, the same vertebra in both images; lung_label: which regions of the
+    lung mask together are lung, where it holds several."""
 
     spine_ct: Triple | None = None
     spine_cbct_inflated: Triple | None = None
     lung_mask_ct: FileName | None = None
+    lung_label: Labels | None = None
     deflated_surface: FileName | None = None
 
     @model_validator(mode="after")
@@ -77,6 +125,8 @@ class HintValues(_Table):
             raise ValueError(
                 "names the spine in one image only; give both spine_ct and spine_cbct_inflated, or neither"
             )
+        if self.lung_label is not None and self.lung_mask_ct is None:
+            raise ValueError("has a lung_label but no lung_mask_ct; add the mask that it chooses from, or remove it")
         return self
 
 
@@ -102,12 +152,17 @@ class CaseFile(_Table):
 def read_case_file(folder: Path) -> CaseFile:
     """case.toml of a case folder. Raises CaseError when it is missing, no TOML, or has unknown or wrong keys."""
     path = folder / FILE_NAME
-    if not path.is_file():
-        raise CaseError(f"{folder} holds no {FILE_NAME}; name a case folder, or write one as the README shows.")
-    try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise CaseError(f"{path} is not valid TOML ({error}); correct it.") from error
+    with reading(path, "case file", "correct it", CaseError):
+        if not path.is_file():
+            raise CaseError(f"{folder} holds no {FILE_NAME}; name a case folder, or write one as the README shows.")
+        try:
+            table = tomllib.loads(path.read_text(encoding="utf-8-sig"))  # editors on Windows begin it with a mark
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            raise CaseError(f"{path} is not valid TOML ({error}); correct it.") from error
+        return _validated(table, path)
+
+
+def _validated(table: dict[str, Any], path: Path) -> CaseFile:
     try:
         return CaseFile.model_validate(table)
     except ValidationError as error:

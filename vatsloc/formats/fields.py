@@ -14,6 +14,7 @@ import numpy as np
 
 from registration.maps.field import DisplacementField
 from vatsloc.errors import InputRefused
+from vatsloc.formats.guard import guarded
 from vatsloc.formats.nifti import nifti_image, open_nifti, read_nifti, save_nifti
 from vatsloc.formats.raw import check_affine
 from vatsloc.frames import flip_field, reorient
@@ -36,6 +37,7 @@ def write_field(path: Path, field: DisplacementField, axes: str | None = None) -
     save_nifti(image, path)
 
 
+@guarded("displacement field", "write it again")
 def read_field(path: Path) -> DisplacementField:
     """Displacement field in RAS mm. Raises InputRefused when it is no 5-D vector image of intent 1006 or 1007."""
     image, intent = read_nifti(path), int(open_nifti(path)[1]["intent_code"])

@@ -72,7 +72,7 @@ def is_result(folder: Path) -> bool:
     """Whether a folder holds a result of this program."""
     try:
         run = json.loads((folder / RUN_FILE).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return False
     return isinstance(run, dict) and run.get("program") == PROGRAM
 

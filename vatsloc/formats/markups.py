@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import csv
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,21 +18,28 @@ import numpy as np
 
 from registration.volume import Array
 from vatsloc.errors import CaseError, InputRefused
+from vatsloc.formats.guard import guarded
 from vatsloc.frames import flip_points
 
 SCHEMA = "https://raw.githubusercontent.com/slicer/slicer/master/Modules/Loadable/Markups/Resources/Schema/markups-schema-v1.0.3.json#"
 _FRAMES = {"RAS": "RAS", "LPS": "LPS", "0": "RAS", "1": "LPS"}
 _POINT_TYPES = ("Fiducial", "Curve", "ClosedCurve", "Line")
+_PLACED, _NOT_PLACED = "defined", ("undefined", "preview", "missing")
 _FCSV_COLUMNS = "id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label,desc,associatedNodeID"
+_FCSV_NOT_PLACED, _FCSV_PLACED = ("0", "1", "3"), "2"
+"""What Slicer 5 writes in the column after the last one that it names."""
+_TURN_ROUNDING = 1e-3
 
 
 @dataclass(frozen=True)
 class PointList:
-    """Labelled points. ras: (n, 3) mm; labels and descriptions: n strings."""
+    """Labelled points. ras: (n, 3) mm; labels and descriptions: n strings; unplaced: labels of points that the file
+    names but holds no place for."""
 
     ras: Array
     labels: tuple[str, ...]
     descriptions: tuple[str, ...] = field(default=())
+    unplaced: tuple[str, ...] = field(default=())
 
     def __post_init__(self) -> None:
         if np.ndim(self.ras) != 2 or np.shape(self.ras)[1] != 3:
@@ -47,18 +55,16 @@ class PointList:
         return len(self.labels)
 
 
+@guarded("Slicer point list", "save the points as .mrk.json")
 def read_points(path: Path) -> PointList:
-    """Defined points of a .mrk.json, .json or .fcsv file, in the file's order.
+    """Points of a .mrk.json, .json or .fcsv file, in the file's order; those that were never placed are left out.
 
     Raises CaseError when the file is not there, InputRefused when it is unreadable, states no frame, is not in mm or
     holds no finite point.
     """
     if not path.is_file():
         raise CaseError(f"{path} does not exist; correct the path or put the points there.")
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputRefused(f"{path} cannot be read as text ({error}); save the points again.") from error
+    text = path.read_text(encoding="utf-8-sig")
     points = _from_fcsv(text, path) if path.suffix.lower() == ".fcsv" else _from_json(text, path)
     if len(points) == 0:
         raise InputRefused(f"{path} holds no defined points; place them and save again.")
@@ -105,14 +111,29 @@ def _from_json(text: str, path: Path) -> PointList:
     units = markup.get("coordinateUnits", "mm")
     if (units[0] if isinstance(units, list) and units else units) != "mm":
         raise InputRefused(f"{path} is in {units}, not mm; save the points in millimetres.")
-    entries = [entry for entry in entries if entry.get("positionStatus", "defined") == "defined"]
-    try:
-        xyz = np.array([[float(c) for c in entry["position"]] for entry in entries]).reshape(len(entries), 3)
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputRefused(f"{path} has a point without three coordinates; place it again.") from error
-    labels = tuple(str(entry.get("label") or entry.get("id") or n) for n, entry in enumerate(entries, start=1))
-    descriptions = tuple(str(entry.get("description", "")) for entry in entries)
-    return PointList(_to_ras(xyz, markup.get("coordinateSystem"), path), labels, descriptions)
+    for entry in entries:
+        if entry.get("positionStatus", _PLACED) not in (_PLACED, *_NOT_PLACED):
+            raise InputRefused(f"{path} has a point of positionStatus {entry['positionStatus']!r}; save it again.")
+    named = [(str(entry.get("label") or entry.get("id") or n), entry) for n, entry in enumerate(entries, start=1)]
+    placed = [(label, entry) for label, entry in named if entry.get("positionStatus", _PLACED) == _PLACED]
+    xyz = np.array([_position(entry, label, path) for label, entry in placed]).reshape(len(placed), 3)
+    return PointList(
+        _to_ras(xyz, markup.get("coordinateSystem"), path),
+        tuple(label for label, _ in placed),
+        tuple(str(entry.get("description", "")) for _, entry in placed),
+        tuple(label for label, entry in named if entry.get("positionStatus", _PLACED) != _PLACED),
+    )
+
+
+def _position(entry: Mapping[str, Any], label: str, path: Path) -> list[float]:
+    xyz = entry.get("position")
+    numbers = isinstance(xyz, list) and all(isinstance(c, int | float) and not isinstance(c, bool) for c in xyz)
+    if not isinstance(xyz, list) or not numbers or len(xyz) != 3:
+        raise InputRefused(
+            f"{path} has a point without three coordinates: {label} has position {xyz!r}, three numbers needed "
+            "(with decimal points, without quotes); place it again."
+        )
+    return [float(c) for c in xyz]
 
 
 def _from_fcsv(text: str, path: Path) -> PointList:
@@ -125,16 +146,43 @@ def _from_fcsv(text: str, path: Path) -> PointList:
         elif line.strip():
             rows.append(line)
     columns = [name.strip() for name in comments.get("columns", _FCSV_COLUMNS).split(",")]
+    if not {"x", "y", "z", "label"} <= set(columns) or len(set(columns)) != len(columns):
+        raise InputRefused(
+            f"{path} is not a Slicer .fcsv file (columns {', '.join(columns)}); save the points as .mrk.json."
+        )
+    table = [_fcsv_row(row, columns, path) for row in csv.reader(rows)]
+    named = [(row["label"] or str(n), row) for n, row in enumerate(table, start=1)]
+    placed = [(label, row) for label, row in named if row["status"] not in _FCSV_NOT_PLACED]
+    xyz = np.array([[float(row[axis]) for axis in "xyz"] for _, row in placed]).reshape(len(placed), 3)
+    return PointList(
+        _to_ras(xyz, comments.get("coordinatesystem"), path),
+        tuple(label for label, _ in placed),
+        tuple(row.get("desc", "") for _, row in placed),
+        tuple(label for label, row in named if row["status"] in _FCSV_NOT_PLACED),
+    )
+
+
+def _fcsv_row(values: list[str], columns: list[str], path: Path) -> dict[str, str]:
+    """A row by column, "status" being what Slicer 5 adds after the last one.
+
+    A decimal comma moves everything to its right by a column, so the columns with known contents are looked at too.
+    """
+    more = values[len(columns) :]
+    row = dict(zip(columns, values, strict=False)) | {"status": more[0] if more else _FCSV_PLACED}
     try:
-        at = {name: columns.index(name) for name in ("x", "y", "z", "label")}
-        table = list(csv.reader(rows))
-        xyz = np.array([[float(row[at[axis]]) for axis in "xyz"] for row in table]).reshape(len(table), 3)
-        labels = tuple(row[at["label"]] or str(n) for n, row in enumerate(table, start=1))
-    except (ValueError, IndexError) as error:
-        raise InputRefused(f"{path} is not a Slicer .fcsv file ({error}); save the points as .mrk.json.") from error
-    desc = columns.index("desc") if "desc" in columns else -1
-    descriptions = tuple(row[desc] if 0 <= desc < len(row) else "" for row in table)
-    return PointList(_to_ras(xyz, comments.get("coordinatesystem"), path), labels, descriptions)
+        numbers = [float(row[axis]) for axis in "xyz"]
+        turn = [float(row[name]) for name in ("ow", "ox", "oy", "oz") if name in columns]
+        known = all(row[name] in ("0", "1") for name in ("vis", "sel", "lock") if name in columns)
+    except (KeyError, ValueError):
+        numbers, turn, known = [], [], False
+    unit = not turn or abs(float(np.linalg.norm(turn)) - 1) < _TURN_ROUNDING
+    extra = not more or (columns[-1] == "associatedNodeID" and len(more) <= 2)
+    if not (numbers and known and unit and extra and row["status"] in (_FCSV_PLACED, *_FCSV_NOT_PLACED)):
+        raise InputRefused(
+            f"{path} is not a Slicer .fcsv file (row {','.join(values)!r} does not fit the columns "
+            f"{','.join(columns)}; decimal commas?); save the points as .mrk.json."
+        )
+    return row
 
 
 def _to_ras(xyz: Array, stated: Any, path: Path) -> Array:

@@ -17,6 +17,7 @@ import trimesh
 
 from registration.volume import Array
 from vatsloc.errors import CaseError, InputRefused
+from vatsloc.formats.guard import guarded
 from vatsloc.formats.markups import read_points
 from vatsloc.frames import flip_points
 
@@ -55,19 +56,22 @@ def write_vtu(path: Path, mesh: TetraMesh) -> None:
     )
 
 
+@guarded(".vtu mesh", "write it again")
 def read_vtu(path: Path) -> TetraMesh:
-    """Tetrahedra and data of a .vtu in LPS mm. Raises InputRefused when unreadable or of other cells."""
+    """Tetrahedra and data of a .vtu in LPS mm. Raises InputRefused when unreadable, not finite or of other cells."""
     _check_exists(path)
-    try:
-        mesh = meshio.vtu.read(path)  # meshio.read prints and exits on a bad file
-    except Exception as error:
-        raise InputRefused(f"{path} is not a readable .vtu mesh ({error}); write it again.") from error
+    mesh = meshio.vtu.read(path)  # meshio.read prints and exits on a bad file
     if len(mesh.cells) != 1 or mesh.cells[0].type != "tetra":
         kinds = ", ".join(block.type for block in mesh.cells)
         raise InputRefused(f"{path} holds cells of type {kinds}, tetra needed; write linear tetrahedra.")
+    points, tets = np.asarray(mesh.points, dtype=float), np.asarray(mesh.cells[0].data)
+    if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
+        raise InputRefused(f"{path} holds points that are not three finite numbers; write it again.")
+    if len(tets) == 0 or tets.min() < 0 or tets.max() >= len(points):
+        raise InputRefused(f"{path} holds no tetrahedra, or some of points that it does not hold; write it again.")
     return TetraMesh(
-        flip_points(mesh.points),
-        mesh.cells[0].data,
+        flip_points(points),
+        tets,
         {name: _flip_vectors(values) for name, values in mesh.point_data.items()},
         {name: _flip_vectors(values[0]) for name, values in mesh.cell_data.items()},
     )
@@ -84,6 +88,7 @@ def write_stl(path: Path, points_ras: Array, triangles: Array) -> None:
     path.write_bytes(header + records.tobytes())
 
 
+@guarded("STL surface")
 def read_surface(path: Path) -> Surface:
     """Surface of an .stl, or points of a .mrk.json or .fcsv where a surface is expected.
 
@@ -95,13 +100,13 @@ def read_surface(path: Path) -> Surface:
         return Surface(read_points(path).ras, np.empty((0, 3), dtype=int))
     if suffix != ".stl":
         raise CaseError(f"{path} is no surface file; give an .stl, or points in a .mrk.json.")
-    try:
-        mesh = trimesh.load_mesh(path, file_type="stl")
-        points, triangles = np.asarray(mesh.vertices, dtype=float), np.asarray(mesh.faces, dtype=int)
-    except Exception as error:
-        raise InputRefused(f"{path} is not a readable STL surface ({error}); export it again.") from error
-    if len(triangles) == 0 or not np.isfinite(points).all():
-        raise InputRefused(f"{path} holds no triangles, or corners that are not finite; export it again.")
+    mesh = trimesh.load_mesh(path, file_type="stl", process=False)  # which would drop corners that are not finite
+    if not np.isfinite(mesh.vertices).all():
+        raise InputRefused(f"{path} holds corners that are not finite; export it again.")
+    mesh.merge_vertices()
+    points, triangles = np.asarray(mesh.vertices, dtype=float), np.asarray(mesh.faces, dtype=int)
+    if len(triangles) == 0:
+        raise InputRefused(f"{path} holds no triangles; export it again.")
     stated = re.search(rb"SPACE\s*=\s*(RAS|LPS)", path.read_bytes()[:300])
     if stated is None or stated.group(1) == b"LPS":
         points = flip_points(points)

@@ -73,12 +73,16 @@ class FieldFile:
 Item = Frame | VolumeFile | ModelFile | PointsFile | FieldFile
 
 
-def write_scene(path: Path, items: Sequence[Item], folder: Path, background: str, foreground: str) -> None:
+def write_scene(
+    path: Path, items: Sequence[Item], folder: Path, background: str, foreground: str, note: str = ""
+) -> None:
     """Write a scene whose files are named relative to `folder`, where it will lie; two volumes fill the slice views.
 
-    Raises ValueError for a frame or a volume that no item has.
+    note: a comment at its head. Raises ValueError for a frame or a volume that no item has.
     """
     root = ET.Element("MRML", version="Slicer 5.0.0", userTags="")
+    if note:
+        root.append(ET.Comment(f" {note.replace('--', '- -')} "))
     scene = _Scene(root, folder.resolve(), {i.name: f"vtkMRMLLinearTransformNode{n}" for n, i in _frames(items)})
     volumes: dict[str, str] = {}
     for number, item in enumerate(items, 1):

@@ -17,10 +17,19 @@ from scipy.spatial.transform import Rotation
 
 from registration.volume import Array
 from vatsloc.errors import CaseError, InputRefused
+from vatsloc.formats.guard import guarded
 from vatsloc.frames import flip_transform
 
 _HEADER = "#Insight Transform File V1.0\n#Transform 0\nTransform: AffineTransform_double_3_3\n"
-_MATRIX_KINDS = ("AffineTransform", "MatrixOffsetTransformBase")
+_PARAMETERS = {
+    "AffineTransform": 12,
+    "MatrixOffsetTransformBase": 12,
+    "Euler3DTransform": 6,
+    "VersorRigid3DTransform": 6,
+}
+_VERSOR_ROUNDING = 1e-6
+_LEAST_DETERMINANT = 1e-6
+"""A map that flattens space loses points, which no transform between two images does."""
 
 
 def write_tfm(path: Path, to_from_ras: Array) -> None:
@@ -30,6 +39,7 @@ def write_tfm(path: Path, to_from_ras: Array) -> None:
     path.write_text(f"{_HEADER}Parameters: {parameters}\nFixedParameters: 0 0 0\n", encoding="ascii")
 
 
+@guarded("ITK transform", "export the transform again")
 def read_tfm(path: Path) -> Array:
     """Point map (4, 4) in RAS mm of an affine, Euler or versor transform.
 
@@ -42,32 +52,38 @@ def read_tfm(path: Path) -> Array:
     if sum(key == "Transform" for key, _ in entries) != 1:
         raise InputRefused(f"{path} does not hold exactly one ITK transform; export one linear transform as .tfm.")
     fields = dict(entries)
+    kind = fields["Transform"].partition("_")[0]
+    if kind not in _PARAMETERS:
+        raise InputRefused(f"{path} holds a {fields['Transform']}; export a rigid or affine transform.")
     try:
         parameters = np.array(fields["Parameters"].split(), dtype=float)
         fixed = np.array(fields["FixedParameters"].split(), dtype=float)
-        linear = _linear_part(fields["Transform"].partition("_")[0], parameters, fixed)
     except (KeyError, ValueError) as error:
         raise InputRefused(f"{path} has unreadable parameters ({error}); export the transform again.") from error
-    if linear is None:
-        raise InputRefused(f"{path} holds a {fields['Transform']}; export a rigid or affine transform.")
-    if len(fixed) < 3 or len(parameters) not in (6, 12) or not np.isfinite([*parameters, *fixed]).all():
-        raise InputRefused(f"{path} has {len(parameters)} parameters and {len(fixed)} fixed ones; export it again.")
+    if len(parameters) != _PARAMETERS[kind] or len(fixed) not in (3, 4) or not np.isfinite([*parameters, *fixed]).all():
+        raise InputRefused(
+            f"{path} has {len(parameters)} parameters and {len(fixed)} fixed ones, {_PARAMETERS[kind]} and 3 finite "
+            "numbers needed; export it again."
+        )
+    linear = _linear_part(kind, parameters, fixed)
+    if not abs(np.linalg.det(linear)) > _LEAST_DETERMINANT:
+        raise InputRefused(f"{path} maps space to a plane or turns it by no versor; export the transform again.")
     centre, matrix = fixed[:3], np.eye(4)
     matrix[:3, :3] = linear
     matrix[:3, 3] = parameters[-3:] + centre - linear @ centre
     return flip_transform(matrix)
 
 
-def _linear_part(kind: str, parameters: Array, fixed: Array) -> Array | None:
-    """M (3, 3), or None for a kind of transform that is not linear or not known."""
-    if kind in _MATRIX_KINDS:
-        return parameters[:9].reshape(3, 3)
+def _linear_part(kind: str, parameters: Array, fixed: Array) -> Array:
+    """M (3, 3); zeros for a versor longer than 1."""
     if kind == "Euler3DTransform":
         order = "ZYX" if len(fixed) > 3 and fixed[3] != 0 else "ZXY"
         angles = [parameters["XYZ".index(axis)] for axis in order]
         return np.asarray(Rotation.from_euler(order, angles).as_matrix())
     if kind == "VersorRigid3DTransform":
         versor = parameters[:3]
-        scalar = np.sqrt(max(1.0 - float(versor @ versor), 0.0))
-        return np.asarray(Rotation.from_quat([*versor, scalar]).as_matrix())
-    return None
+        rest = 1.0 - float(versor @ versor)
+        if rest < -_VERSOR_ROUNDING:
+            return np.zeros((3, 3))
+        return np.asarray(Rotation.from_quat([*versor, np.sqrt(max(rest, 0.0))]).as_matrix())
+    return parameters[:9].reshape(3, 3)

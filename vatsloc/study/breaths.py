@@ -14,6 +14,7 @@ from poro.mesh import TetMesh, stuff
 from registration.images.resample import resample_mask
 from registration.volume import Mask
 from vatsloc.errors import CaseError, InputRefused
+from vatsloc.formats.guard import reading
 from vatsloc.formats.images import read_mask
 from vatsloc.imaging.lungs import Side, split_lungs
 from vatsloc.study.breathing import Lung
@@ -97,7 +98,8 @@ def read_person(folder: Path) -> Person:
 
 
 def _landmarks(path: Path) -> Array:
-    lines = path.read_text(encoding="utf-8").splitlines()
+    with reading(path, "table of numbers", "write six numbers per line"):
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
     if not lines or [name.strip() for name in lines[0].split(",")] != _COLUMNS:
         raise CaseError(f"{path} starts with {lines[0] if lines else 'nothing'!r}; write {','.join(_COLUMNS)}.")
     try:

@@ -9,9 +9,8 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
-from concurrent.futures import Executor, ThreadPoolExecutor, as_completed
-from contextlib import contextmanager
+from collections.abc import Sequence
+from concurrent.futures import as_completed
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -22,6 +21,7 @@ from vatsloc.errors import CaseError
 from vatsloc.formats.casefile import FILE_NAME
 from vatsloc.formats.folder import RUN_FILE, write_whole
 from vatsloc.results import REPORT
+from vatsloc.study.pool import pool
 from vatsloc.workflow.stages import Say, quiet
 
 OUTCOME_FILE = "outcome.json"
@@ -134,8 +134,8 @@ def run_cohort(
     done = {job.folder.name: old for job in todo if (old := _kept(job)) is not None}
     missing = [job for job in todo if job.folder.name not in done]
     say(f"{len(done)} of {len(todo)} cases are done, {len(missing)} to run")
-    with _pool(jobs, scheduler) as pool:
-        running = [pool.submit(run_one, job) for job in missing]
+    with pool(jobs, scheduler) as executor:
+        running = [executor.submit(run_one, job) for job in missing]
         for finished in as_completed(running):
             outcome = finished.result()
             done[outcome.name] = outcome
@@ -294,21 +294,3 @@ def _measured(job: Job, arguments: list[str]) -> tuple[int, float, float, str]:
     process.returncode = os.waitstatus_to_exitcode(status)
     words = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
     return process.returncode, time.monotonic() - start, usage.ru_maxrss / 1024, words[-1] if words else ""
-
-
-@contextmanager
-def _pool(jobs: int, scheduler: str | None) -> Iterator[Executor]:
-    if scheduler is None:
-        with ThreadPoolExecutor(jobs) as pool:
-            try:
-                yield pool
-            except BaseException:
-                pool.shutdown(cancel_futures=True)
-                raise
-        return
-    try:
-        from distributed import Client
-    except ImportError as missing:
-        raise CaseError('--scheduler needs Dask: install "distributed", or leave the option out.') from missing
-    with Client(scheduler) as client:
-        yield client.get_executor()

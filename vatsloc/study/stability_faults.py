@@ -25,8 +25,9 @@ WRONG_MM = 3.0
 """A run is wrong where its landmarks are off by more than this on average, or its nodule is."""
 LOBE_SHARE, LOBE_MM = 0.35, 10.0
 
-Fault = Callable[[Array, np.random.Generator], Array]
-"""From where a run puts the lung's nodes (n, 3) mm to where a fault puts them."""
+Fault = Callable[[Array, Array, np.random.Generator], Array]
+"""From the lung's nodes before the collapse, placed by the spine, and where a run puts them, (n, 3) mm each, to where a
+fault puts them."""
 
 
 def stability_faults(cases: Sequence[Path], out: Path, settings: Settings, say: Say = quiet) -> None:
@@ -120,7 +121,7 @@ def _rows(scene: Scene, other: Case | None, found: Localization) -> list[tuple[s
     """Every fault and how the run fared; found: the run without any."""
     rows = [("nothing", score(found, scene.truth))]
     for name, fault in FAULTS.items():
-        moved = fault(found.collapse.points_after, np.random.default_rng(0))
+        moved = fault(found.collapse.mesh_before.points, found.collapse.points_after, np.random.default_rng(0))
         rows.append((name, score(_answered(scene, replace(found.collapse, points_after=moved)), scene.truth)))
     for name, run in _whole_runs(scene, other).items():
         try:
@@ -157,17 +158,17 @@ def _answered(scene: Scene, found: Collapse) -> Localization:
 
 
 def _shifted(mm: float) -> Fault:
-    return lambda nodes, rng: nodes + mm * direction(rng)
+    return lambda _before, nodes, rng: nodes + mm * direction(rng)
 
 
 def _turned(degrees: float) -> Fault:
-    def fault(nodes: Array, rng: np.random.Generator) -> Array:
+    def fault(_before: Array, nodes: Array, rng: np.random.Generator) -> Array:
         return RigidTransform.about(nodes.mean(axis=0), np.radians(degrees) * direction(rng), np.zeros(3))(nodes)
 
     return fault
 
 
-def _part_shifted(nodes: Array, rng: np.random.Generator) -> Array:
+def _part_shifted(_before: Array, nodes: Array, rng: np.random.Generator) -> Array:
     """The part of the lung beyond a plane, as a lobe that slid unseen."""
     along = nodes @ direction(rng)
     return np.where((along > np.quantile(along, 1 - LOBE_SHARE))[:, None], nodes + LOBE_MM * direction(rng), nodes)
@@ -179,6 +180,10 @@ FAULTS: dict[str, Fault] = {
     "shift 15 mm": _shifted(15.0),
     "turn 5 degrees": _turned(5.0),
     "one lobe off 10 mm": _part_shifted,
-    "nodes in another order": lambda nodes, rng: rng.permutation(nodes),
+    "left and right exchanged": lambda _before, nodes, _rng: (
+        np.array([-1, 1, 1]) * (nodes - nodes.mean(axis=0)) + nodes.mean(axis=0)
+    ),
+    "stale state: not collapsed": lambda before, _nodes, _rng: before,
+    "nodes in another order": lambda _before, nodes, rng: rng.permutation(nodes),
 }
 """Faults in a finished answer."""

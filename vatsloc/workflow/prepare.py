@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from registration.volume import Mask
 from vatsloc.case import Case
 from vatsloc.imaging.cbct import PreparedCbct, prepare_cbct
+from vatsloc.imaging.lung_hint import operated_lung
 from vatsloc.imaging.lungs import Lungs, segment_lungs
 from vatsloc.imaging.spine import Spine, segment_spine
 from vatsloc.workflow.stages import Stages
@@ -31,6 +32,9 @@ def prepare(case: Case, stages: Stages) -> Prepared:
         lungs = segment_lungs(case.ct, case.side, case.nodule.mask, case.nodule.centre_ras)
     hinted = case.hints.lung_mask_ct
     if hinted is not None:
+        hinted, said = operated_lung(hinted, lungs, case.side, case.nodule.centre_ras, case.nodule.mask)
+        for sentence in said:
+            stages.warn(sentence)
         lungs = replace(lungs, left=hinted) if case.side == "left" else replace(lungs, right=hinted)
     with stages.stage("CBCT preparation"):
         inflated, deflated = prepare_cbct(case.cbct_inflated), prepare_cbct(case.cbct_deflated)

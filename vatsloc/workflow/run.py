@@ -22,8 +22,8 @@ from vatsloc.maps import covered, sampled
 from vatsloc.report.collect import report_data
 from vatsloc.report.data import LUNG, SURFACE, Outline, Picture
 from vatsloc.report.render import write_report
-from vatsloc.results import OUTPUT_FILES, RADIUS95, REPORT, SCENE, ResultData, RunRecord, write_results
-from vatsloc.scene import write_result_scene
+from vatsloc.results import OUTPUT_FILES, RADIUS95, REPORT, ResultData, RunRecord, write_results
+from vatsloc.scene import write_result_scenes
 from vatsloc.workflow.certainty import radius95, scatter
 from vatsloc.workflow.localize import Localization, localize, surface_distances
 from vatsloc.workflow.pneumothorax import contact_surface
@@ -56,7 +56,7 @@ def run_case(folder: Path, out: Path, settings: Settings, say: Say = quiet) -> d
         with stages.stage("write"):
             result = _result(case, found, fields, _record(case, found, settings, stages))
             write_results(partial, result)
-            write_result_scene(partial / SCENE, folder, out, result)
+            write_result_scenes(partial, folder, out, result)
         with stages.stage("report"):
             write_report(partial / REPORT, report_data(case, result, _pictures(case, found)))
     return result.run.as_json()
