@@ -21,7 +21,7 @@ from scipy import ndimage
 
 from registration.volume import Array
 from vatsloc.errors import InputRefused
-from vatsloc.formats.dicom import decoder
+from vatsloc.formats.dicom.decoder import decode
 from vatsloc.formats.dicom.header import Header, read_header
 
 PADDING_HU = -1024.0
@@ -141,7 +141,7 @@ def _decoded_here(header: Header) -> Array:
         syntax = _syntax(header)
         if not syntax.is_encapsulated:
             _check_length(whole)
-        return decoder.decode(whole.dataset)
+        return decode(whole.dataset)
     except InputRefused:
         raise
     except Exception as error:
@@ -163,7 +163,7 @@ def _check_length(header: Header) -> None:
 def _decoded_apart(files: list[Path]) -> Iterator[Array]:
     if not files:
         return
-    command = [sys.executable, "-P", decoder.__file__]
+    command = [sys.executable, "-P", str(Path(__file__).with_name("decoder.py"))]
     with tempfile.TemporaryFile() as asked:
         asked.write(json.dumps([str(file) for file in files]).encode())
         asked.seek(0)
