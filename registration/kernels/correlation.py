@@ -10,7 +10,7 @@ import numpy as np
 from numba import njit
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True)
 def coefficient(n, f, m, ff, mm, fm, flat_f, flat_m):
     """Correlation of n values f and m from the sums of f, m, f^2, m^2 and f m; -1 where either varies too little.
 

@@ -87,7 +87,7 @@ def _centred(image: MaskedImage) -> MaskedImage:
     return MaskedImage(hu, np.ascontiguousarray(image.inside))
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True)
 def _warped(moving, affine, half):
     """A cube of the moving image on the fixed one's voxels, and which of them count."""
     size = 2 * half + 1
@@ -110,7 +110,7 @@ def _warped(moving, affine, half):
     return MaskedImage(cube, known)
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True)
 def _correlation(block, image, a, b, c):
     """NCC of a block with the one of an image whose first voxel is (a, b, c), over voxels that count in both; -1 where
     those are few or show nothing.
@@ -134,7 +134,7 @@ def _correlation(block, image, a, b, c):
     return coefficient(n, f, m, ff, mm, fm, flat, flat)
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True)
 def _scores(block, image, first, reach):
     """NCC (2 reach + 1, ...) at every shift about the voxel `first` (3,) of an image, and the shift (3,) of the
     best.
@@ -154,7 +154,7 @@ def _scores(block, image, first, reach):
     return scores, best
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True)
 def _block(image, first, width):
     """The block whose first voxel is `first` (3,)."""
     a, b, c = first
@@ -164,7 +164,7 @@ def _block(image, first, width):
     )
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True)
 def _match(fixed, moving, start, affine, search, shift, around, back):
     """One block of `match_affine_blocks`."""
     radius, reach = search.radius, search.reach

@@ -168,7 +168,7 @@ def subvoxel_peak(around: Array) -> tuple[Array, Array]:
     return result, known
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True)
 def _block(image, at, radius, step):
     """The block about voxel `at`, every `step`-th voxel."""
     width = 2 * radius // step + 1
@@ -188,7 +188,7 @@ def _block(image, at, radius, step):
     return _Block(values, squares, step)
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True)
 def _correlation(block, image, search, a, b, c):
     """NCC of a block with the one about voxel (a, b, c) of an image; -1 where that cannot be believed or shows
     nothing.
@@ -212,7 +212,7 @@ def _correlation(block, image, search, a, b, c):
     return coefficient(count, zero, m, block.squares, mm, fm, zero, np.float32(FLAT_HU**2))
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True)
 def _hill_climb(block, image, search, start, shift, around):
     """Move `shift` (3,) to the highest of the 27 scores about it until it is itself the highest; its score."""
     for _ in range(2 * search.reach):
@@ -236,7 +236,7 @@ def _hill_climb(block, image, search, start, shift, around):
     return around[13]
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True)
 def _candidates(block, image, search, start, shifts):
     """Fill shifts (m, 3) with the best of every other one by subsampled blocks, best first; how many there are."""
     scores, reach = np.empty(len(shifts), np.float32), search.reach
@@ -258,7 +258,7 @@ def _candidates(block, image, search, start, shifts):
     return count
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True)
 def _match(fixed, moving, start, search, best, around):
     """One point of `_match_all`."""
     radius = search.radius
