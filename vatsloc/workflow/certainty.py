@@ -98,6 +98,7 @@ def nearest_places(collapse: Collapse, deflated: Array) -> tuple[Array, Array]:
 
 def place_sigma_mm(distance_mm: Array, misfit_mm: Array) -> Array:
     """Standard deviation (n,) per axis of tissue so far (n,) from a place found again, of an answer that misses the
-    places about it by so much (n,).
+    places about it by so much (n,): no less than that of one registration, by which places are found.
     """
-    return PER_MISFIT * misfit_mm + PER_MM * np.maximum(distance_mm - REACH_MM, 0.0)
+    told = PER_MISFIT * misfit_mm + PER_MM * np.maximum(distance_mm - REACH_MM, 0.0)
+    return np.maximum(told, REGISTRATION_MM)
