@@ -9,7 +9,7 @@ from vatsloc.case import Case
 from vatsloc.imaging.cbct import PreparedCbct, prepare_cbct
 from vatsloc.imaging.lungs import Lungs, segment_lungs
 from vatsloc.imaging.spine import Spine, segment_spine
-from vatsloc.workflow.stages import Stages
+from vatsloc.workflow.stages import CT, DEFLATED, INFLATED, Stages
 
 
 @dataclass(frozen=True)
@@ -27,15 +27,21 @@ class Prepared:
 
 def prepare(case: Case, stages: Stages) -> Prepared:
     """Segment the CT and clean the cone-beam images. Raises InputRefused when one does not show what it should."""
-    with stages.stage("CT lungs"):
+    with stages.stage("CT lungs", CT):
         lungs = segment_lungs(case.ct, case.side, case.nodule.mask, case.nodule.centre_ras)
     hinted = case.hints.lung_mask_ct
     if hinted is not None:
         lungs = replace(lungs, left=hinted) if case.side == "left" else replace(lungs, right=hinted)
     with stages.stage("CBCT preparation"):
-        inflated, deflated = prepare_cbct(case.cbct_inflated), prepare_cbct(case.cbct_deflated)
+        stages.on(INFLATED)
+        inflated = prepare_cbct(case.cbct_inflated)
+        stages.on(DEFLATED)
+        deflated = prepare_cbct(case.cbct_deflated)
     with stages.stage("spines"):
+        stages.on(CT)
         spine_ct = segment_spine(case.ct)
+        stages.on(INFLATED)
         spine_inflated = segment_spine(inflated.volume, inflated.field.usable)
+        stages.on(DEFLATED)
         spine_deflated = segment_spine(deflated.volume, deflated.field.usable)
     return Prepared(lungs, lungs.of(case.side), inflated, deflated, spine_ct, spine_inflated, spine_deflated)

@@ -45,7 +45,7 @@ def run_case(folder: Path, out: Path, settings: Settings, say: Say = quiet) -> d
     Raises the errors of reading and of `localize`; `out` is then untouched.
     """
     stages = Stages(say)
-    with whole_folder(out, OUTPUT_FILES) as partial:
+    with whole_folder(out, OUTPUT_FILES) as partial, stages.named():
         with stages.stage("read"):
             case = read_case(folder)
         for sentence in case.warnings:
