@@ -62,6 +62,29 @@ def localize(
 
 
 @app.command()
+def new(
+    case: Annotated[Path, typer.Argument(metavar="CASE", help="Case folder to make; nothing is overwritten.")],
+    ct: Annotated[Path, typer.Option("--ct", metavar="PATH", help="CT: file, or folder of DICOM slices.")],
+    inflated: Annotated[Path, typer.Option("--inflated", metavar="PATH", help="Cone-beam CT of the inflated lung.")],
+    deflated: Annotated[Path, typer.Option("--deflated", metavar="PATH", help="Cone-beam CT of the collapsed lung.")],
+    nodule: Annotated[
+        str, typer.Option("--nodule", metavar="FILE|X,Y,Z", help="Mask or markup in the CT, or its centre in RAS mm.")
+    ],
+    lps: Annotated[bool, typer.Option("--lps", help="X,Y,Z is LPS, as 3D Slicer's files and DICOM have it.")] = False,
+    copy: Annotated[bool, typer.Option("--copy", help="Copy the files; else they are linked.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Make a case folder of three images and a nodule, and say what they show."""
+    from vatsloc.new_case import Sources, new_case, nodule_source, sentences
+
+    told = new_case(case, Sources(ct, inflated, deflated, nodule_source(nodule, lps)), copy)
+    if as_json:
+        show(told)
+    else:
+        print(sentences(told))
+
+
+@app.command()
 def evaluate(
     case: CaseArgument,
     result: Annotated[Path, typer.Argument(metavar="DIR", help="Results folder of the case.")],

@@ -18,6 +18,7 @@ GRAVITY_LENGTH_TOLERANCE = 0.05
 Side = Literal["right", "left"]
 PleuralGas = Literal["air", "co2"]
 Coordinate = Annotated[float, Field(allow_inf_nan=False)]
+Slope = Annotated[float, Field(allow_inf_nan=False, gt=0)]
 Triple = tuple[Coordinate, Coordinate, Coordinate]
 FileName = Annotated[str, Field(min_length=1)]
 
@@ -27,11 +28,17 @@ class _Table(BaseModel):
 
 
 class ImageFiles(_Table):
-    """Paths relative to the case folder."""
+    """Paths relative to the case folder; HU = slope x value + intercept where an image is not in HU."""
 
     ct: FileName
     cbct_inflated: FileName
     cbct_deflated: FileName
+    ct_slope: Slope | None = None
+    ct_intercept: Coordinate | None = None
+    cbct_inflated_slope: Slope | None = None
+    cbct_inflated_intercept: Coordinate | None = None
+    cbct_deflated_slope: Slope | None = None
+    cbct_deflated_intercept: Coordinate | None = None
 
 
 class NoduleFiles(_Table):
@@ -89,9 +96,9 @@ class LandmarkFiles(_Table):
 
 
 class CaseFile(_Table):
-    """The whole of case.toml."""
+    """The whole of case.toml. side: of the operated lung, None where the images are to tell it."""
 
-    side: Side
+    side: Side | None = None
     images: ImageFiles
     nodule: NoduleFiles
     setup: Setup = Setup()

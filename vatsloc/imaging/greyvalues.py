@@ -28,12 +28,13 @@ LEAST_PEAK = 2e-3
 LEAN_BESIDE_FAT = 0.25
 """Height of the lean tissue's peak beside that of fat, at least."""
 LEAST_LUNG_ABOVE_AIR = 0.06
-BONE_HU = 150.0
+LEAST_BONE = 0.1
+"""How far bone lies above soft tissue, at least, as a share of what soft tissue lies above air."""
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """hu = slope value + intercept. air, tissue: grey values taken for -1000 and 40 HU, None where the map was stated."""
+    """hu = slope value + intercept. air, tissue: grey values taken for -1000 and 40 HU, None where it was stated."""
 
     slope: float
     intercept: float
@@ -50,17 +51,19 @@ class Calibration:
 
 
 def in_hu(image: Volume) -> bool:
-    """Whether the values can be HU: the darkest is air, and there is tissue about water; what fills the corners does
-    not count.
+    """Whether the values can be HU: the darkest is air, and there is tissue about water.
+
+    What fills the corners does not count, unless it is air in HU and nothing reads as tissue does in other units.
     """
     thin = image.hu[::4, ::4, ::4]
     fill = fill_value(image.hu)
     content = thin if fill is None else thin[thin != fill]
     if content.size == 0:
         return False
-    lowest = float(np.percentile(content, 1))
+    lowest, highest = (float(level) for level in np.percentile(content, (1, 99)))
     tissue = float(np.mean(np.abs(content) < 300))
-    return MIN_PADDING_HU <= lowest <= MAX_AIR_HU and tissue >= LEAST_TISSUE_SHARE
+    air_filled = fill is not None and abs(fill - AIR_HU) <= 100 and highest < 700 and highest - lowest > 20
+    return MIN_PADDING_HU <= lowest and (lowest <= MAX_AIR_HU or air_filled) and tissue >= LEAST_TISSUE_SHARE
 
 
 def fill_value(values: Array) -> float | None:
@@ -78,6 +81,18 @@ def calibrate(image: Volume) -> Calibration:
 
     Raises InputRefused with the reason where the two are not seen.
     """
+    air, tissue = peaks(image)
+    if not -0.15 * (tissue - air) <= air <= 0.75 * tissue:
+        raise InputRefused("the darker of its two tissues is too bright for air")
+    slope = (TISSUE_HU - AIR_HU) / (tissue - air)
+    return Calibration(slope, AIR_HU - slope * air, air, tissue)
+
+
+def peaks(image: Volume) -> tuple[float, float]:
+    """Grey values of air and of lean soft tissue, where the image is homogeneous. Raises InputRefused as `calibrate`.
+
+    Air is the darkest of at least two kinds of dark tissue, soft tissue the brighter of lean and fat; bone is brighter.
+    """
     content, flat = _content(image)
     level = _parting(content)
     dark, bright = float(content[content < level].mean()), float(content[content >= level].mean())
@@ -86,18 +101,14 @@ def calibrate(image: Volume) -> Calibration:
     below = homogeneous[homogeneous < level]
     air = _lowest(below, bright - dark)
     span = tissue - air
-    if not -0.15 * span <= air <= 0.75 * tissue:
-        raise InputRefused("the darker of its two tissues is too bright for air")
     lung = content[content < level]
     if np.mean(lung > air + LEAST_LUNG_ABOVE_AIR * span) < 0.05:
         raise InputRefused("it shows air or lung, but not both")
     if np.mean(below < air - 2 * LEAST_LUNG_ABOVE_AIR * span) > 1e-3:
         raise InputRefused("air cannot be told from lung")
-    slope = (TISSUE_HU - AIR_HU) / span
-    map_ = Calibration(slope, AIR_HU - slope * air, air, tissue)
-    if float(np.percentile(map_.of(content), 99.9)) < BONE_HU:
+    if (float(np.percentile(content, 99.9)) - tissue) / span < LEAST_BONE:
         raise InputRefused("nothing is brighter than soft tissue as bone is")
-    return map_
+    return air, tissue
 
 
 def calibrated(image: Volume, by: Calibration) -> Volume:

@@ -8,13 +8,14 @@ from registration.volume import Mask
 from vatsloc.case import Case
 from vatsloc.imaging.cbct import PreparedCbct, prepare_cbct
 from vatsloc.imaging.lungs import Lungs, segment_lungs
+from vatsloc.imaging.side import PleuralGas, pleural_gas
 from vatsloc.imaging.spine import Spine, segment_spine
 from vatsloc.workflow.stages import CT, DEFLATED, INFLATED, Stages
 
 
 @dataclass(frozen=True)
 class Prepared:
-    """Images fit for registration. lung_ct: the operated lung on the CT's grid."""
+    """Images fit for registration. lung_ct: the operated lung on the CT's grid; gas: beside the lungs in the CBCTs."""
 
     lungs: Lungs
     lung_ct: Mask
@@ -23,6 +24,7 @@ class Prepared:
     spine_ct: Spine
     spine_inflated: Spine
     spine_deflated: Spine
+    gas: PleuralGas
 
 
 def prepare(case: Case, stages: Stages) -> Prepared:
@@ -44,4 +46,6 @@ def prepare(case: Case, stages: Stages) -> Prepared:
         spine_inflated = segment_spine(inflated.volume, inflated.field.usable)
         stages.on(DEFLATED)
         spine_deflated = segment_spine(deflated.volume, deflated.field.usable)
-    return Prepared(lungs, lungs.of(case.side), inflated, deflated, spine_ct, spine_inflated, spine_deflated)
+        gas = pleural_gas(inflated, deflated, spine_inflated, spine_deflated)
+        gas.require(case.side)
+    return Prepared(lungs, lungs.of(case.side), inflated, deflated, spine_ct, spine_inflated, spine_deflated, gas)

@@ -182,6 +182,8 @@ def _record(case: Case, found: Localization, settings: Settings, stages: Stages)
             "settings": settings.model_dump(),
             "input_sha256": dict(case.input_sha256),
             "side": case.side,
+            "side_evidence": {"told_by": case.side_told_by, **found.prepared.gas.entry()},
+            "calibration": {name: by.entry() for name, by in case.calibration.items()},
             "gravity_ras": case.gravity_ras,
             "choices": [choice.entry() for choice in stages.choices],
             "solid": found.collapse.model.solid.entry(),
