@@ -11,7 +11,7 @@ import numpy as np
 from registration.volume import Volume
 from vatsloc.errors import InputRefused
 from vatsloc.formats.casefile import ImageFiles
-from vatsloc.imaging.greyvalues import MAX_AIR_HU, Calibration, calibrate, calibrated, in_hu
+from vatsloc.imaging.greyvalues import MAX_AIR_HU, Calibration, calibrate, calibrated, in_hu, may_be_hu
 
 IMAGES = ("ct", "cbct_inflated", "cbct_deflated")
 
@@ -38,12 +38,10 @@ def in_hounsfield(
         if name in stated:
             maps[name] = stated[name]
             done[name] = _by_statement(name, image, stated[name], paths[name])
-        elif in_hu(image):
+        elif in_hu(image) or (by := _found(name, image, paths[name])) is None:
             done[name] = image
         else:
-            maps[name] = _found(name, image, paths[name])
-            done[name] = calibrated(image, maps[name])
-            by = maps[name]
+            maps[name], done[name] = by, calibrated(image, by)
             warnings.append(
                 f"{paths[name].name} is not in HU: its air reads {by.air:.4g} and its soft tissue {by.tissue:.4g}, "
                 f"so HU = {by.slope:.5g} x value {by.intercept:+.1f} was taken."
@@ -62,10 +60,13 @@ def _by_statement(name: str, image: Volume, by: Calibration, path: Path) -> Volu
     return hu
 
 
-def _found(name: str, image: Volume, path: Path) -> Calibration:
+def _found(name: str, image: Volume, path: Path) -> Calibration | None:
+    """The map by peaks; None where there are none, but the image can be HU."""
     try:
         found = calibrate(image)
     except InputRefused as why:
+        if may_be_hu(image):
+            return None
         lowest = float(np.percentile(image.hu[::4, ::4, ::4], 1))
         raise InputRefused(
             f"{path} shows no air in HU (its lowest percent starts at {lowest:.4g}) and cannot be calibrated: {why}; "

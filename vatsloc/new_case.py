@@ -44,7 +44,7 @@ class Sources:
 
 def nodule_source(text: str, lps: bool) -> Path | Array:
     """The file that `text` names, or the point X,Y,Z in mm that it is, in RAS. Raises CaseError where it is neither."""
-    if Path(text).exists():
+    if text.strip() and Path(text).exists():
         if lps:
             raise CaseError("--lps is about a point X,Y,Z; a file states its own frame, so leave --lps out.")
         return Path(text)
@@ -149,7 +149,7 @@ def _write_case_file(folder: Path, case: Case | None, names: Mapping[str, str], 
 def _told(case: Case) -> dict[str, Any]:
     images = {"ct": case.ct, "cbct_inflated": case.cbct_inflated, "cbct_deflated": case.cbct_deflated}
     gas = _gas(case)
-    gas.require(case.side)
+    gas.require(case.side, case.side_told_by)
     return {
         "images": {name: _image(case, name, image) for name, image in images.items()},
         "nodule_ras": [round(float(x), 2) for x in case.nodule.centre_ras],

@@ -249,7 +249,6 @@ def refused(folder: Path, error: type[VatslocError], sentence: str) -> None:
             {"images": {"ct": "a", "cbct_inflated": "b", "cbct_defalted": "c"}},
             r"\[images\] cbct_defalted is an unknown key",
         ),
-        ({"side": None}, "side is missing; add it"),
         ({"images": {"ct": "ct.nii.gz", "cbct_inflated": "x"}}, r"\[images\] cbct_deflated is missing; add it"),
         ({"side": "Right"}, "side = 'Right' is wrong .*'right' or 'left'"),
         ({"nodule": {}}, r"\[nodule\] names neither mask nor point; add mask"),

@@ -51,19 +51,30 @@ class Calibration:
 
 
 def in_hu(image: Volume) -> bool:
-    """Whether the values can be HU: the darkest is air, and there is tissue about water.
-
-    What fills the corners does not count, unless it is air in HU and nothing reads as tissue does in other units.
+    """Whether the values are HU: the darkest is air, and there is tissue about water; what fills the corners does not
+    count.
     """
-    thin = image.hu[::4, ::4, ::4]
+    lowest, _, tissue = _range(image.hu, fill_value(image.hu))
+    return MIN_PADDING_HU <= lowest <= MAX_AIR_HU and tissue >= LEAST_TISSUE_SHARE
+
+
+def may_be_hu(image: Volume) -> bool:
+    """Whether an image that shows no air but that of its corners can be HU: that reads -1000, all else as tissue."""
     fill = fill_value(image.hu)
+    if fill is None or abs(fill - AIR_HU) > 100:
+        return False
+    _, highest, tissue = _range(image.hu, fill)
+    return tissue >= LEAST_TISSUE_SHARE and highest < 700 and not 0 < highest <= 5
+
+
+def _range(values: Array, fill: float | None) -> tuple[float, float, float]:
+    """Lowest and highest percent of what was not filled, and the share of it within 300 of 0."""
+    thin = values[::4, ::4, ::4]
     content = thin if fill is None else thin[thin != fill]
     if content.size == 0:
-        return False
-    lowest, highest = (float(level) for level in np.percentile(content, (1, 99)))
-    tissue = float(np.mean(np.abs(content) < 300))
-    air_filled = fill is not None and abs(fill - AIR_HU) <= 100 and highest < 700 and highest - lowest > 20
-    return MIN_PADDING_HU <= lowest and (lowest <= MAX_AIR_HU or air_filled) and tissue >= LEAST_TISSUE_SHARE
+        return 0.0, 0.0, 0.0
+    lowest, highest = np.percentile(content, (1, 99))
+    return float(lowest), float(highest), float(np.mean(np.abs(content) < 300))
 
 
 def fill_value(values: Array) -> float | None:

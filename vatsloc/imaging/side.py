@@ -45,14 +45,14 @@ class PleuralGas:
         clear = ml >= LEAST_GAS_ML and ml >= TIMES_THE_OTHER * self.deflated_ml[other]
         return most if clear and ml >= TIMES_BEFORE * self.inflated_ml[most] else None
 
-    def require(self, side: Side) -> None:
-        """Raise InputRefused where the gas has clearly gathered on the other side."""
+    def require(self, side: Side, told_by: str) -> None:
+        """Raise InputRefused where the gas has clearly gathered on another side than `told_by` tells."""
         if self.side not in (None, side):
             ml = self.deflated_ml
             raise InputRefused(
                 f"The deflated CBCT shows {ml[self.side or side]:.0f} ml of pleural gas on the {self.side} side and "
-                f"{ml[side]:.0f} ml on the {side} one, the operated one; correct side or cbct_deflated in case.toml, "
-                "or mend the image's orientation."
+                f"{ml[side]:.0f} ml on the {side} one, the operated one by {told_by}; correct side, nodule or "
+                "cbct_deflated in case.toml, or mend the image's orientation."
             )
 
     def entry(self) -> dict[str, Any]:

@@ -47,5 +47,5 @@ def prepare(case: Case, stages: Stages) -> Prepared:
         stages.on(DEFLATED)
         spine_deflated = segment_spine(deflated.volume, deflated.field.usable)
         gas = pleural_gas(inflated, deflated, spine_inflated, spine_deflated)
-        gas.require(case.side)
+        gas.require(case.side, case.side_told_by)
     return Prepared(lungs, lungs.of(case.side), inflated, deflated, spine_ct, spine_inflated, spine_deflated, gas)
