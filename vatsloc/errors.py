@@ -48,16 +48,14 @@ class GateFailed(VatslocError):
     exit_code = 5
 
 
-def as_ours(error: Exception, stage: str = "", image: str = "") -> VatslocError:
-    """The error that `error` is to the user, with a sentence that names `stage` and `image` where they are known.
+def as_ours(error: Exception, where: str = "The command", image: str = "") -> VatslocError:
+    """The error that `error` is to the user, with a sentence that begins with `where` and names `image` if it is known.
 
     Ours stay what they are, an image put in front where its sentence names none. Raise the answer `from error`.
     """
     if isinstance(error, VatslocError):
         return error if image.lower() in str(error).lower() else type(error)(f"{image}: {error}")
-    where = f"The stage '{stage}'" if stage else "The command"
-    if image:
-        where += f" ({image})"
+    where = f"{where} ({image})" if image else where
     said = " ".join(str(error).split()).rstrip(".") or "no message"
     if isinstance(error, MemoryError):
         return NoAnswer(f"{where} ran out of memory ({said}); close other programs, or take --preset fast.")

@@ -83,7 +83,10 @@ def test_whatever_a_stage_raises_ends_by_a_code_and_a_sentence_and_leaves_nothin
     last = said.strip().splitlines()[-1]
     assert last.startswith("vatsloc: ")
     if "stage '" in last:
-        assert last.startswith("vatsloc: The stage 'deflated surface'" + (" (deflated CBCT) " if inside else " "))
+        begins = (
+            "The stage 'deflated surface' (deflated CBCT) " if inside else "What follows the stage 'deflated surface' "
+        )
+        assert last.startswith(f"vatsloc: {begins}")
     assert list(tmp_path.iterdir()) == []
 
 

@@ -12,6 +12,7 @@ from registration.volume import Volume
 from tests.vatsloc.imaging_thorax import Thorax, cone_beam, dice, thorax
 from vatsloc.calibration import in_hounsfield
 from vatsloc.errors import InputRefused
+from vatsloc.imaging.cbct import field_of_view
 from vatsloc.imaging.greyvalues import Calibration, calibrate, calibrated, fill_value, in_hu, peaks
 from vatsloc.imaging.lungs import Lungs, segment_lungs
 
@@ -79,6 +80,12 @@ def test_what_fills_the_corners_of_a_cone_beam_ct_is_not_taken_for_air(scene: Th
     assert level(hu, truth, -1000) == pytest.approx(-1000, abs=30)
     assert level(hu, truth, 40) == pytest.approx(40, abs=30)
     assert (hu.hu[outside] == -1000).all()
+
+
+def test_the_field_of_view_is_found_in_any_unit(scene: Thorax) -> None:
+    seen = cone_beam(scene.volume, (30.0, 0.0), 105.0)
+    grey = Volume(SCALES["attenuation, 1/mm"](seen.hu).astype(np.float32), seen.ras_from_ijk)
+    assert np.array_equal(field_of_view(grey).usable.inside, field_of_view(seen).usable.inside)
 
 
 def test_an_image_in_hu_stays_as_it_is_bit_for_bit(scene: Thorax) -> None:

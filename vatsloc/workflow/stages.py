@@ -36,7 +36,7 @@ class Stages:
     choices: list[Choice] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     _start: float = field(default_factory=time.perf_counter)
-    _stage: str = ""
+    _where: str = "The command"
     _image: str = ""
 
     @contextmanager
@@ -47,7 +47,7 @@ class Stages:
         the block works on one or says so by `on`.
         """
         self.say(f"{name} ...")
-        self._stage, self._image = name, image
+        self._where, self._image = f"The stage '{name}'", image
         reset = _reset_peak()
         start, start_cpu = time.perf_counter(), time.process_time()
         with self.named():
@@ -55,7 +55,7 @@ class Stages:
         self.seconds[name] = round(time.perf_counter() - start, 3)
         self.cpu_seconds[name] = round(time.process_time() - start_cpu, 3)
         self.peak_mb[name] = round(_peak_mb(reset), 1)
-        self._image = ""
+        self._where, self._image = f"What follows the stage '{name}'", ""
         self.say(f"{name}: {self.seconds[name]:.1f} s")
 
     def on(self, image: str) -> None:
@@ -68,7 +68,7 @@ class Stages:
         try:
             yield
         except Exception as error:
-            ours = as_ours(error, self._stage, self._image)
+            ours = as_ours(error, self._where, self._image)
             if ours is error:
                 raise
             raise ours from error
