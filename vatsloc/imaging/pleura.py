@@ -67,7 +67,7 @@ def find_pneumothorax(cbct: PreparedCbct, prior: ThoraxPrior) -> Pneumothorax:
     part = whole.grid.box(np.array([b.start for b in box]), np.array([b.stop for b in box]))
     fine = Volume(whole.hu[box], part.ras_from_ijk)
     aerated = near[box] & (fine.hu < AERATED_HU)
-    limit, contrast = _air_limit(fine.hu[aerated][::7])
+    limit, contrast = air_limit(fine.hu[aerated][::7])
     air = np.zeros(fine.grid.shape, dtype=bool)
     if contrast >= LEAST_CONTRAST_HU:
         air = _pleural_air(fine, aerated, work, space, airways.inside, (limit, contrast))
@@ -103,7 +103,7 @@ def _pleural_air(
     return _large_pieces(ndimage.uniform_filter((aerated & dark).astype(np.float32), 3) > 0.5, tubes, voxel_ml)
 
 
-def _air_limit(hu: Array) -> tuple[float, float]:
+def air_limit(hu: Array) -> tuple[float, float]:
     """HU half-way between pleural air and lung, and their distance: Otsu's two classes, then their peaks."""
     counts, edges = np.histogram(hu, bins=np.arange(-1030.0, AERATED_HU, 5.0))
     level = (edges[:-1] + edges[1:]) / 2
