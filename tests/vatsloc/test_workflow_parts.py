@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from poro.mesh import TetMesh, stuff_level_set
+from poro.mesh import TetMesh, stuff, stuff_level_set
 from registration.rigid import RigidTransform
 from registration.volume import Grid, Mask
 from vatsloc.errors import CaseError, InputRefused
@@ -100,10 +100,10 @@ def test_stages_are_timed_and_refusals_named() -> None:
     with stages.stage("one"):
         pass
     with (
-        pytest.raises(InputRefused, match="The stage 'two' cannot work with these images: empty mask"),
+        pytest.raises(InputRefused, match="The stage 'two' cannot work with these images: edge_mm must be positive"),
         stages.stage("two"),
     ):
-        raise ValueError("empty mask")
+        stuff(np.ones((4, 4, 4), dtype=bool), np.eye(4), -1.0)
     assert list(stages.seconds) == ["one"]
     assert 0 <= stages.seconds["one"] <= stages.total_seconds
     assert stages.peak_mb["one"] > 1
