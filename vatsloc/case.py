@@ -9,26 +9,29 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from registration.volume import Array, Grid, Mask, Volume, axis_codes
+from vatsloc.calibration import in_hounsfield, stated_maps
 from vatsloc.errors import CaseError, InputRefused
-from vatsloc.formats.casefile import CaseFile, PleuralGas, SeriesName, Side, Triple, read_case_file
+from vatsloc.formats.casefile import FILE_NAME, CaseFile, PleuralGas, SeriesName, Side, Triple, read_case_file
 from vatsloc.formats.dicom.regions import holds_regions
 from vatsloc.formats.guard import reading
 from vatsloc.formats.images import files_behind, read_volume_and_warnings, stated_frame
 from vatsloc.formats.markups import PointList, read_points
 from vatsloc.formats.meshes import Surface
 from vatsloc.frames import reorient
+from vatsloc.imaging.cbct import prepare_cbct
+from vatsloc.imaging.greyvalues import Calibration
+from vatsloc.imaging.side import nodule_side, pleural_gas
+from vatsloc.imaging.spine import segment_spine
 from vatsloc.marks import AXES, Nodule, NoduleSource, inside_of, mask_on, one_point, read_hint_surface, read_nodule
 
 MIN_OVERLAP = 0.2
 """Share of the smaller image's box that must lie inside the other; headers promise poses within about 10 cm."""
-MAX_AIR_HU = -500.0
-"""The lowest percent of voxels of a chest image in HU is air, far below this."""
 IMAGE_MM = (60.0, 3000.0)
 """Between these lies the longest side of any image of a chest, not of one in metres or micrometres."""
 
@@ -48,7 +51,8 @@ class Case:
     """Everything `localize` may know.
 
     side: of the operated lung; gravity_ras: unit (3,) in the CBCT's frame; input_sha256 and stored_axes: by name of the
-    input; warnings: sentences for the report.
+    input; warnings: sentences for the report; calibration: what made images HU, by name of those that were not;
+    side_told_by: "case.toml", "nodule" or "pleural gas".
     """
 
     folder: Path
@@ -63,6 +67,8 @@ class Case:
     input_sha256: Mapping[str, str]
     stored_axes: Mapping[str, str]
     warnings: tuple[str, ...] = ()
+    calibration: Mapping[str, Calibration] = field(default_factory=dict)
+    side_told_by: str = FILE_NAME
 
 
 @dataclass(frozen=True)
@@ -83,7 +89,6 @@ def read_case(folder: Path) -> Case:
     """
     file = read_case_file(folder)
     paths = _input_paths(folder, file)
-    gravity = _gravity(file.side, file.setup.gravity_cbct)
     with ThreadPoolExecutor(max_workers=2) as pool:  # decompression and hashing release the interpreter lock
         names = ("ct", "cbct_inflated", "cbct_deflated")
         images = pool.map(lambda name: _read_image(paths[name], file.images.series(name)), names)
@@ -94,22 +99,49 @@ def read_case(folder: Path) -> Case:
         _check_overlap(ct.grid, (inflated if name == "cbct_inflated" else deflated).grid, paths["ct"], paths[name])
     _check_overlap(inflated.grid, deflated.grid, paths["cbct_inflated"], paths["cbct_deflated"])
     warnings = [*said, *said_inflated, *said_deflated]
+    hu, calibration = in_hounsfield(
+        {"ct": ct, "cbct_inflated": inflated, "cbct_deflated": deflated}, paths, stated_maps(file.images), warnings
+    )
+    ct, inflated, deflated = hu.values()
     frame = _frame_of_ct(paths, file)
     source = NoduleSource(paths.get("nodule_mask"), file.nodule.label, paths.get("nodule_point"), frame)
+    nodule = read_nodule(source, ct.grid, warnings)
+    side, side_told_by = (file.side, FILE_NAME) if file.side else told_side(ct, inflated, deflated, nodule)
     return Case(
         folder=folder,
-        side=file.side,
+        side=side,
         ct=ct,
         cbct_inflated=inflated,
         cbct_deflated=deflated,
-        nodule=read_nodule(source, ct.grid, warnings),
-        gravity_ras=gravity,
+        nodule=nodule,
+        gravity_ras=_gravity(side, file.setup.gravity_cbct),
         pleural_gas=file.setup.pleural_gas,
         hints=_hints(file, paths, (ct.grid, inflated.grid, deflated.grid), frame, warnings),
         input_sha256=input_sha256,
         stored_axes={"ct": ct_axes, "cbct_inflated": inflated_axes, "cbct_deflated": deflated_axes},
         warnings=tuple(warnings),
+        calibration=calibration,
+        side_told_by=side_told_by,
     )
+
+
+def told_side(ct: Volume, inflated: Volume, deflated: Volume, nodule: Nodule) -> tuple[Side, str]:
+    """The operated side, and what told it: the lung that holds the nodule, else the pleural gas.
+
+    Raises InputRefused where neither does; `prepare` refuses a nodule and gas that contradict each other.
+    """
+    side = nodule_side(ct, nodule.mask, nodule.centre_ras)
+    if side is not None:
+        return side, "nodule"
+    before, after = prepare_cbct(inflated), prepare_cbct(deflated)
+    spines = (segment_spine(image.volume, image.field.usable) for image in (before, after))
+    side = pleural_gas(before, after, *spines).side
+    if side is None:
+        raise InputRefused(
+            "Neither the nodule's place in the CT nor pleural gas in the deflated CBCT tells the operated side; "
+            'add side = "right" or side = "left" to case.toml.'
+        )
+    return side, "pleural gas"
 
 
 def read_landmarks(folder: Path) -> Landmarks:
@@ -184,18 +216,12 @@ def _read_image(path: Path, series: SeriesName | None) -> tuple[Volume, str, tup
             f"{path} measures {' x '.join(f'{mm:.3g}' for mm in size)} mm, which no image of a chest does; "
             "export it with its voxel size in millimetres."
         )
-    lowest = float(np.percentile(volume.hu[::4, ::4, ::4], 1))
-    if lowest > MAX_AIR_HU:
-        raise InputRefused(
-            f"{path} shows no air (its lowest percent starts at {lowest:.0f}), so it is no chest image in HU; "
-            "export it with its rescale to HU."
-        )
     hu, ras_from_ijk = reorient(volume.hu, volume.ras_from_ijk, AXES)
     return Volume(np.ascontiguousarray(hu), ras_from_ijk), axis_codes(volume.ras_from_ijk), warnings
 
 
 def _check_overlap(a: Grid, b: Grid, path_a: Path, path_b: Path) -> None:
-    share = max(_share_inside(a, b), _share_inside(b, a))
+    share = image_overlap(a, b)
     if share < MIN_OVERLAP:
         centres = [grid.to_ras((np.array(grid.shape) - 1) / 2) for grid in (a, b)]
         apart = float(np.linalg.norm(centres[0] - centres[1]))
@@ -203,6 +229,11 @@ def _check_overlap(a: Grid, b: Grid, path_a: Path, path_b: Path) -> None:
             f"{path_a} and {path_b} overlap by {100 * share:.0f} % ({apart:.0f} mm between centres), "
             f"{100 * MIN_OVERLAP:.0f} % needed; place them within about 10 cm of each other by their headers."
         )
+
+
+def image_overlap(a: Grid, b: Grid) -> float:
+    """Share of the smaller of two images' boxes that lies inside the other."""
+    return max(_share_inside(a, b), _share_inside(b, a))
 
 
 def _share_inside(a: Grid, b: Grid) -> float:

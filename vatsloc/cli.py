@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+import traceback
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -12,7 +13,7 @@ import typer
 # Before numpy is first imported: a lung's fronts are too small to share, and waiting threads burn the other core.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-from vatsloc.errors import CaseError, GateFailed, VatslocError
+from vatsloc.errors import CaseError, GateFailed, as_ours
 from vatsloc.study.commands import bench, stability
 from vatsloc.terminal import JsonOption, say, show
 
@@ -20,13 +21,21 @@ app = typer.Typer(
     add_completion=False,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
-    help="Where is the nodule in the collapsed lung? CT + inflated CBCT + deflated CBCT in, position and report out.",
 )
 
 app.add_typer(bench, name="bench")
 app.add_typer(stability, name="stability")
 
+DEBUG = "--debug"
+
 CaseArgument = Annotated[Path, typer.Argument(metavar="CASE", help="Case folder with case.toml.")]
+
+
+@app.callback()
+def _whole_program(
+    debug: Annotated[bool, typer.Option(DEBUG, help="Show the traceback of what ends a command early.")] = False,
+) -> None:
+    """Where is the nodule in the collapsed lung? CT + inflated CBCT + deflated CBCT in, position and report out."""
 
 
 @app.command()
@@ -50,6 +59,29 @@ def localize(
     failed = [gate["says"] for gate in run["gates"].values() if not gate["ok"]]
     if failed:
         raise GateFailed(f"The result is written to {out}, but do not trust it: {' '.join(failed)}")
+
+
+@app.command()
+def new(
+    case: Annotated[Path, typer.Argument(metavar="CASE", help="Case folder to make; nothing is overwritten.")],
+    ct: Annotated[Path, typer.Option("--ct", metavar="PATH", help="CT: file, or folder of DICOM slices.")],
+    inflated: Annotated[Path, typer.Option("--inflated", metavar="PATH", help="Cone-beam CT of the inflated lung.")],
+    deflated: Annotated[Path, typer.Option("--deflated", metavar="PATH", help="Cone-beam CT of the collapsed lung.")],
+    nodule: Annotated[
+        str, typer.Option("--nodule", metavar="FILE|X,Y,Z", help="Mask or markup in the CT, or its centre in RAS mm.")
+    ],
+    lps: Annotated[bool, typer.Option("--lps", help="X,Y,Z is LPS, as 3D Slicer's files and DICOM have it.")] = False,
+    copy: Annotated[bool, typer.Option("--copy", help="Copy the files; else they are linked.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Make a case folder of three images and a nodule, and say what they show."""
+    from vatsloc.new_case import Sources, new_case, nodule_source, sentences
+
+    told = new_case(case, Sources(ct, inflated, deflated, nodule_source(nodule, lps)), copy)
+    if as_json:
+        show(told)
+    else:
+        print(sentences(told))
 
 
 @app.command()
@@ -217,15 +249,20 @@ def paper(
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run the command line; errors a user can act on become one sentence and an exit code."""
+    """Run the command line; whatever ends it early becomes one sentence and an exit code.
+
+    `--debug` may stand anywhere among the arguments; the error's traceback is then printed before its sentence.
+    """
+    given = sys.argv[1:] if arguments is None else arguments
+    kept = [word for word in given if word != DEBUG]
     try:
-        app(args=arguments, standalone_mode=True)
-    except VatslocError as error:
-        say(f"vatsloc: {error}")
-        sys.exit(error.exit_code)
-    except OSError as error:
-        say(f"vatsloc: {error.strerror or error} ({error.filename}); check path, permissions and free space.")
-        sys.exit(CaseError.exit_code)
+        app(args=kept, standalone_mode=True)
+    except Exception as error:
+        if len(kept) < len(given):
+            traceback.print_exc()
+        ending = as_ours(error)
+        say(f"vatsloc: {ending}")
+        sys.exit(ending.exit_code)
 
 
 if __name__ == "__main__":

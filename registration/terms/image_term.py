@@ -47,11 +47,19 @@ class ImageTerm:
         self._last: tuple[Array, _Warped] | None = None
 
     def refresh(self, c: Array) -> None:
-        """Reset each sample's weight to how well the moving image sees it at c (soft rejection)."""
+        """Reset each sample's weight to how well the moving image sees it at c (soft rejection).
+
+        Raises ValueError when it sees none.
+        """
         if self._seen is not None:
             moved = self._points + self._lattice.forward(c).reshape(3, -1)[:, self.samples.index].T
             share = 4 * interpolate(self._seen.hu, self._seen.grid, moved, 0.0) - 3
             self.share, self._last = np.clip(share, 0, 1).astype(np.float32), None
+        if not self.share.any():
+            raise ValueError(
+                f"the moving image sees none of the {len(self.share)} samples of the fixed mask at this voxel size; "
+                "check both masks and the prior map"
+            )
 
     def value(self, c: Array) -> float:
         """D at c."""

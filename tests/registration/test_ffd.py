@@ -249,3 +249,12 @@ def test_few_matches_hold_the_finest_levels_little_and_let_them_bend_little() ->
     assert (none.bending, none.keypoints) == (6.0, 0.0)
     assert (some.bending, some.keypoints) == (pytest.approx(4.0), pytest.approx(0.5))
     assert (many.bending, many.keypoints) == (pytest.approx(2.0), pytest.approx(1.0))
+
+
+@pytest.mark.parametrize("window_mm", [14.0, None])
+def test_a_moving_image_that_sees_none_of_the_samples_is_refused(window_mm: float | None) -> None:
+    image = image_of(PATTERN, oriented("RAS", (20, 20, 20), 4.0, CENTRE))
+    nothing = Mask(np.zeros(image.hu.shape, dtype=bool), image.ras_from_ijk)
+    settings = FfdSettings(spacing_mm=32.0, levels=1, voxel_mm=4.0, window_mm=window_mm)
+    with pytest.raises(ValueError, match="sees none of the 8000 samples of the fixed mask"):
+        register_ffd(image, image, settings, moving_mask=nothing)

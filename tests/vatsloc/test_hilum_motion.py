@@ -109,7 +109,7 @@ def test_the_prior_takes_the_shift_back_before_the_spine() -> None:
         ({"lumen": False}, HilumSource.STILL),
         ({"contrast_hu": 59.0}, HilumSource.STILL),
         ({"contrast_hu": 61.0}, HilumSource.AIRWAYS),
-        ({"usable": np.zeros(scene.deflated().hu.shape, bool)}, HilumSource.SHIFT),
+        ({"usable": np.zeros(scene.deflated().hu.shape, bool)}, HilumSource.FEW),
     ],
 )
 def test_what_is_seen_of_the_airways_decides(
@@ -119,7 +119,7 @@ def test_what_is_seen_of_the_airways_decides(
     assert moved.source is source
     expected = {
         HilumSource.STILL: np.zeros_like(POINTS),
-        HilumSource.SHIFT: np.broadcast_to(AS_A_WHOLE, POINTS.shape),
+        HilumSource.FEW: np.broadcast_to(AS_A_WHOLE, POINTS.shape),
         HilumSource.AIRWAYS: motion(POINTS),
     }
     assert_allclose(moved.displacement, expected[source], atol=0.02)
@@ -142,3 +142,12 @@ def test_a_registration_that_goes_astray_folds_or_cannot_be_turned_round_gives_w
     # All of space on one plane: most points are not reached.
     flat = found(monkeypatch, Registration(lambda points: right(points) * [1, 1, 0] + [0, 0, scene.CENTRE_INF[2]]))
     assert flat.source is HilumSource.SHIFT
+
+
+def test_airways_that_the_inflated_scan_does_not_see_move_the_hilum_as_a_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    def blind(*_args: Any, **_rest: Any) -> Any:
+        raise ValueError("no sample")
+
+    moved = found(monkeypatch, blind)  # type: ignore[arg-type]
+    assert moved.source is HilumSource.FEW
+    assert_allclose(moved.displacement, np.broadcast_to(AS_A_WHOLE, POINTS.shape))

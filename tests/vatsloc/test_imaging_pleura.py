@@ -16,7 +16,7 @@ from vatsloc.errors import InputRefused
 from vatsloc.imaging.cbct import PreparedCbct, prepare_cbct
 from vatsloc.imaging.hilum import track_hilum
 from vatsloc.imaging.lungs import segment_lungs
-from vatsloc.imaging.pleura import Pneumothorax, find_pneumothorax
+from vatsloc.imaging.pleura import Pneumothorax, air_limit, find_pneumothorax
 from vatsloc.imaging.surface import Border, deflated_surface, diaphragm_points
 from vatsloc.imaging.thorax import ThoraxPrior, carry_prior, inflated_lung, require_share, visible_share
 
@@ -185,3 +185,16 @@ def test_nothing_where_the_prior_is_empty(deflated: PreparedCbct, prior: ThoraxP
     assert found.lung_ml == 0.0
     assert len(deflated_surface(found, deflated.field)) == 0
     assert len(diaphragm_points(found.space, found.image, deflated.field)) == 0
+
+
+@pytest.mark.parametrize(("share_of_lung", "seen"), [(0.6, True), (0.15, False)])
+def test_air_beside_a_lung_of_every_density_is_told_by_its_own_width(share_of_lung: float, seen: bool) -> None:
+    """Gas of 25 HU about -870 beside a lung that thins out from -860 to -350 HU; a lung alone has little so far off."""
+    random, n = np.random.default_rng(3), 40000
+    lung = random.triangular(-860, -860, -350, int(share_of_lung * n))
+    hu = np.concatenate([random.normal(-870, 25, n - len(lung)), lung])
+    limit, contrast = air_limit(hu)
+    assert (contrast > 0) is seen
+    if seen:
+        assert contrast == pytest.approx(150, abs=20)
+        assert -815 < limit < -765

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from poro.errors import SolverError
-from poro.mesh import TetMesh, stuff_level_set
+from poro.mesh import TetMesh, stuff, stuff_level_set
 from registration.maps.rigid import RigidTransform
 from registration.volume import Grid, Mask
 from vatsloc.errors import CaseError, InputRefused, NotConverged
@@ -101,12 +101,12 @@ def test_stages_are_timed_and_refusals_named() -> None:
     with stages.stage("one"):
         pass
     with (
-        pytest.raises(InputRefused, match="The stage 'two' cannot work with these images: empty mask"),
+        pytest.raises(InputRefused, match="The stage 'two' cannot work with these images: edge_mm must be positive"),
         stages.stage("two"),
     ):
-        raise ValueError("empty mask")
+        stuff(np.ones((4, 4, 4), dtype=bool), np.eye(4), -1.0)
     for failed in (SolverError("singular"), np.linalg.LinAlgError("singular")):
-        with pytest.raises(NotConverged, match="The stage 'two' has no answer: singular"), stages.stage("two"):
+        with pytest.raises(NotConverged, match=r"The stage 'two' has no answer: singular;"), stages.stage("two"):
             raise failed
     assert list(stages.seconds) == ["one"]
     assert 0 <= stages.seconds["one"] <= stages.total_seconds

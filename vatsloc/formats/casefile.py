@@ -28,6 +28,7 @@ GRAVITY_LENGTH_TOLERANCE = 0.05
 Side = Literal["right", "left"]
 PleuralGas = Literal["air", "co2"]
 Coordinate = Annotated[float, Field(allow_inf_nan=False, strict=True)]
+Slope = Annotated[float, Field(allow_inf_nan=False, strict=True, gt=0)]
 Triple = tuple[Coordinate, Coordinate, Coordinate]
 
 
@@ -60,7 +61,7 @@ class _Table(BaseModel):
 
 class ImageFiles(_Table):
     """Paths relative to the case folder. *_series: UID, number or description of the series to take in a DICOM folder
-    that holds several."""
+    that holds several; HU = slope x value + intercept where an image is not in HU."""
 
     ct: FileName
     cbct_inflated: FileName
@@ -68,6 +69,12 @@ class ImageFiles(_Table):
     ct_series: SeriesName | None = None
     cbct_inflated_series: SeriesName | None = None
     cbct_deflated_series: SeriesName | None = None
+    ct_slope: Slope | None = None
+    ct_intercept: Coordinate | None = None
+    cbct_inflated_slope: Slope | None = None
+    cbct_inflated_intercept: Coordinate | None = None
+    cbct_deflated_slope: Slope | None = None
+    cbct_deflated_intercept: Coordinate | None = None
 
     def series(self, image: str) -> SeriesName | None:
         """What is stated of the image's series: "ct", "cbct_inflated" or "cbct_deflated"."""
@@ -139,9 +146,9 @@ class LandmarkFiles(_Table):
 
 
 class CaseFile(_Table):
-    """The whole of case.toml."""
+    """The whole of case.toml. side: of the operated lung, None where the images are to tell it."""
 
-    side: Side
+    side: Side | None = None
     images: ImageFiles
     nodule: NoduleFiles
     setup: Setup = Setup()

@@ -160,9 +160,9 @@ def _disc_of(shape: tuple[int, ...], centre: Array, radius: float, sx: float, sy
 
 
 def _lit_slices(hu: Array, inside: Array) -> Array:
-    """Slices that hold more than a constant."""
+    """Slices that hold more than a constant, in HU or, as `evaluate` reads them, in the units of the file."""
     values = hu[inside][:: max(int(inside.sum()) // 2000, 1)]
-    return values.max(axis=0) - values.min(axis=0) > 1.0
+    return values.max(axis=0) - values.min(axis=0) > min(1.0, 1e-3 * float(np.ptp(values)))
 
 
 def _radius_map(cbct: Volume, field: FieldOfView) -> Array:

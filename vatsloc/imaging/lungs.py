@@ -46,6 +46,26 @@ def segment_lungs(ct: Volume, side: Side, nodule: Mask | None = None, nodule_ras
     nodule: mask in the CT's frame; nodule_ras: (3,) its centre in RAS mm. Raises InputRefused when the CT does not show
     the lung, or the nodule lies in the other one. Ref: Alvarez 2021, section 6.1.2.
     """
+    work, airways, halves, midline = lung_halves(ct)
+    spacing, voxel_ml = work.grid.spacing, float(work.grid.spacing.prod()) / 1000
+    spots = nodule_voxels(work.grid, nodule, nodule_ras)
+    done = {
+        name: _finished(halves[name], halves[_other(name)], spots if name == side else None, spacing)
+        for name in ("left", "right")
+    }
+    volume = {name: float(done[name].sum()) * voxel_ml for name in done}
+    _check_side(side, volume, halves, spots, spacing)
+    masks = {name: on_grid(done[name], work.grid, ct.grid, smooth_mm=1.5) for name in done}
+    if nodule is not None and nodule.grid.same_as(ct.grid):
+        masks[side] = Mask(masks[side].inside | nodule.inside, ct.ras_from_ijk)
+    return Lungs(masks["left"], masks["right"], on_grid(airways, work.grid, ct.grid), midline, volume)
+
+
+def lung_halves(ct: Volume) -> tuple[Volume, Array, dict[str, Array], float]:
+    """Working copy of `ct`, and on it the airways, the airy part of either lung, and the midline's R coordinate in mm.
+
+    Raises InputRefused when the CT shows no lung.
+    """
     work = working_copy(ct, SPACING_MM)
     spacing, voxel_ml = work.grid.spacing, float(work.grid.spacing.prod()) / 1000
     air = _air_in_body(work)
@@ -60,18 +80,7 @@ def segment_lungs(ct: Volume, side: Side, nodule: Mask | None = None, nodule_ras
             "give a chest CT in HU, or a lung mask as [hints] lung_mask_ct."
         )
     midline = _midline(work.grid, pieces, airways)
-    halves = _sides(work.grid, pieces, midline)
-    spots = _nodule_voxels(work.grid, nodule, nodule_ras)
-    done = {
-        name: _finished(halves[name], halves[_other(name)], spots if name == side else None, spacing)
-        for name in ("left", "right")
-    }
-    volume = {name: float(done[name].sum()) * voxel_ml for name in done}
-    _check_side(side, volume, halves, spots, spacing)
-    masks = {name: on_grid(done[name], work.grid, ct.grid, smooth_mm=1.5) for name in done}
-    if nodule is not None and nodule.grid.same_as(ct.grid):
-        masks[side] = Mask(masks[side].inside | nodule.inside, ct.ras_from_ijk)
-    return Lungs(masks["left"], masks["right"], on_grid(airways, work.grid, ct.grid), midline, volume)
+    return work, airways, _sides(work.grid, pieces, midline), midline
 
 
 def split_lungs(both: Mask) -> dict[Side, Mask]:
@@ -197,7 +206,7 @@ def _grow_both(markers: Array, allowed: Array, steps: int) -> Array:
     return grown
 
 
-def _nodule_voxels(grid: Grid, nodule: Mask | None, nodule_ras: Array | None) -> Array | None:
+def nodule_voxels(grid: Grid, nodule: Mask | None, nodule_ras: Array | None) -> Array | None:
     """Voxels of the nodule on the working grid: the mask, and a small ball about the point."""
     if nodule is None and nodule_ras is None:
         return None

@@ -20,6 +20,11 @@ SMOOTHING_MM = 0.8
 SHADING_MM = 12.0
 LEAST_AIR_ML = 20.0
 LEAST_CONTRAST_HU = 100.0
+AIR_WIDTHS = 2.5
+"""Standard deviations of air from its peak to the level half-way to the lung, where the lung has no peak."""
+LEAST_BESIDE_AIR = 0.25
+"""Share of the voxels that lies as far again beyond that level; 6 to 15 % of an inflated lung lie so far from its peak.
+"""
 AIR_PIECE_ML = 0.5
 LUNG_PIECE_ML = 5.0
 
@@ -63,7 +68,7 @@ def find_pneumothorax(cbct: PreparedCbct, prior: ThoraxPrior) -> Pneumothorax:
     part = whole.grid.box(np.array([b.start for b in box]), np.array([b.stop for b in box]))
     fine = Volume(whole.hu[box], part.ras_from_ijk)
     aerated = near[box] & (fine.hu < AERATED_HU)
-    limit, contrast = _air_limit(fine.hu[aerated][::7])
+    limit, contrast = air_limit(fine.hu[aerated][::7])
     air = np.zeros(fine.grid.shape, dtype=bool)
     if contrast >= LEAST_CONTRAST_HU:
         air = _pleural_air(fine, aerated, work, space, airways.inside, (limit, contrast))
@@ -99,7 +104,7 @@ def _pleural_air(
     return _large_pieces(ndimage.uniform_filter((aerated & dark).astype(np.float32), 3) > 0.5, tubes, voxel_ml)
 
 
-def _air_limit(hu: Array) -> tuple[float, float]:
+def air_limit(hu: Array) -> tuple[float, float]:
     """HU half-way between pleural air and lung, and their distance: Otsu's two classes, then their peaks."""
     counts, edges = np.histogram(hu, bins=np.arange(-1030.0, AERATED_HU, 5.0))
     level = (edges[:-1] + edges[1:]) / 2
@@ -116,8 +121,22 @@ def _air_limit(hu: Array) -> tuple[float, float]:
     air, lung = float(dark[smooth[: cut + 1].argmax()]), float(bright[smooth[cut + 1 :].argmax()])
     trough = smooth[(level > air) & (level < lung)]
     if trough.size == 0 or trough.min() > 0.9 * min(smooth[level == air][0], smooth[level == lung][0]):
-        return (air + lung) / 2, 0.0
+        return _beside_one_peak(level, smooth)
+    if lung - air < LEAST_CONTRAST_HU and level[smooth.argmax()] == air:
+        return _beside_one_peak(level, smooth)
     return (air + lung) / 2, lung - air
+
+
+def _beside_one_peak(level: Array, counts: Array) -> tuple[float, float]:
+    """The same where air alone has a peak, since a diseased lung has every density: the peak's dark flank tells how
+    wide air is. A lung that is all there has little beside its peak.
+    """
+    at = int(counts.argmax())
+    air, dark = float(level[at]), counts[: at + 1]
+    width = float(np.sqrt(np.average((level[: at + 1] - air) ** 2, weights=dark)))
+    contrast = 2 * AIR_WIDTHS * width
+    beyond = float(counts[level > air + contrast].sum() / counts.sum())
+    return air + contrast / 2, contrast if beyond > LEAST_BESIDE_AIR else 0.0
 
 
 def _flooded(work: Volume, space: Array, sure: Array, limit: float) -> Array:

@@ -27,6 +27,7 @@ class HilumSource(Enum):
 
     AIRWAYS = "free-form registration on the dilated airways"
     SHIFT = "the shift of the airways as a whole, since the finer registration went astray"
+    FEW = "the shift of the airways as a whole, since both images show too little of them to be registered"
     STILL = "nothing: the airways were not found again, so the hilum is taken to move with the spine"
     OFF = "nothing: switched off in the settings"
 
@@ -61,15 +62,18 @@ def hilum_motion(
     region = Mask(region.inside & deflated.field.usable.inside, region.ras_from_ijk)
     prior: PointMap = _Shifted(inf_from_def, tracked.shift_mm)
     if not region.inside.any():
-        return HilumMotion(still + tracked.shift_mm, HilumSource.SHIFT)
-    fit = register_ffd(
-        deflated.volume,
-        inflated.volume,
-        FfdSettings(spacing_mm=32.0, levels=2, voxel_mm=2.0, window_mm=None, weights=Weights(bending=300.0)),
-        fixed_mask=region,
-        moving_mask=inflated.field.usable,
-        prior=prior,
-    )
+        return HilumMotion(still + tracked.shift_mm, HilumSource.FEW)
+    try:
+        fit = register_ffd(
+            deflated.volume,
+            inflated.volume,
+            FfdSettings(spacing_mm=32.0, levels=2, voxel_mm=2.0, window_mm=None, weights=Weights(bending=300.0)),
+            fixed_mask=region,
+            moving_mask=inflated.field.usable,
+            prior=prior,
+        )
+    except ValueError:  # no sample of the rim is left, or seen by the inflated image
+        return HilumMotion(still + tracked.shift_mm, HilumSource.FEW)
     inverse = invert_at(fit.moving_from_fixed, inf_from_def(points_def), points_def + tracked.shift_mm)
     moved = inverse.points_fixed - points_def
     astray = np.linalg.norm(moved - tracked.shift_mm, axis=1).max() > FARTHEST_MM or fit.min_det <= 0

@@ -193,7 +193,7 @@ def _spine_gates(name: str, rigid: RigidFit, limits: GateSettings) -> dict[str, 
 
 
 def _note(pose: ChangeOfPose, collapse: Collapse, stages: Stages) -> None:
-    if collapse.observed.motion.source in (HilumSource.SHIFT, HilumSource.STILL):
+    if collapse.observed.motion.source in (HilumSource.SHIFT, HilumSource.FEW, HilumSource.STILL):
         stages.warn(f"The hilum's motion comes from {collapse.observed.motion.source.value}.")
     if collapse.residual is None and "residual registration" not in stages.skipped:
         stages.warn("Too little lung is seen in both CBCTs to correct the model by what they show inside it.")

@@ -22,7 +22,7 @@ from vatsloc.workflow.hilum import HilumMotion, HilumSource, hilum_motion
 from vatsloc.workflow.pose import ChangeOfPose, as_side
 from vatsloc.workflow.prepare import Prepared
 from vatsloc.workflow.settings import Settings
-from vatsloc.workflow.stages import Stages
+from vatsloc.workflow.stages import DEFLATED, Stages
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ def observe(
         )
     def_from_inf = rigid.moving_from_fixed.inverse()
     before = TetMesh(def_from_inf(pose.points_inf), pose.mesh_ct.tets)
-    with stages.stage("deflated surface"):
+    with stages.stage("deflated surface", DEFLATED):
         prior = _prior(prepared, pose, def_from_inf, case.side)
         found = find_pneumothorax(prepared.deflated, prior)
         surface = _hinted_surface(case) or deflated_surface(found, prepared.deflated.field)

@@ -25,7 +25,7 @@ from vatsloc.maps import MeshMap
 from vatsloc.workflow.choices import Choice, weigh
 from vatsloc.workflow.prepare import Prepared
 from vatsloc.workflow.settings import RegistrationSettings, Settings
-from vatsloc.workflow.stages import Stages
+from vatsloc.workflow.stages import CT, INFLATED, Stages
 
 RIM_MM = 4.0
 """Nodes nearer than this to the rim of what the scanner saw are left to the extrapolation."""
@@ -99,10 +99,10 @@ def change_of_pose(
     ct_from_inf_rigid, inf_from_ct_rigid = rigid.moving_from_fixed, rigid.moving_from_fixed.inverse()
     overlap = visible_share(prepared.lung_ct, prepared.inflated.field, inf_from_ct_rigid)
     require_share(overlap, as_side(case.side), settings.gates.min_overlap)
-    with stages.stage("inflated lung"):
+    with stages.stage("inflated lung", INFLATED):
         prior = carry_prior(prepared.lungs, as_side(case.side), prepared.inflated.volume, ct_from_inf_rigid)
         lung_inf = inflated_lung(prepared.inflated, prior)
-    with stages.stage("mesh"):
+    with stages.stage("mesh", CT):
         mesh = stuff(prepared.lung_ct.inside, prepared.lung_ct.ras_from_ijk, settings.mesh.edge_mm)
     placed = TetMesh(inf_from_ct_rigid(mesh.points), mesh.tets)
     if not settings.registration.on:

@@ -45,7 +45,7 @@ def run_case(folder: Path, out: Path, settings: Settings, say: Say = quiet) -> d
     Raises the errors of reading and of `localize`; `out` is then untouched.
     """
     stages = Stages(say)
-    with whole_folder(out, OUTPUT_FILES) as partial:
+    with whole_folder(out, OUTPUT_FILES) as partial, stages.named():
         with stages.stage("read"):
             case = read_case(folder)
         for sentence in case.warnings:
@@ -183,6 +183,8 @@ def _record(case: Case, found: Localization, settings: Settings, stages: Stages)
             "settings": settings.model_dump(),
             "input_sha256": dict(case.input_sha256),
             "side": case.side,
+            "side_evidence": {"told_by": case.side_told_by, **found.prepared.gas.entry()},
+            "calibration": {name: by.entry() for name, by in case.calibration.items()},
             "gravity_ras": case.gravity_ras,
             "choices": [choice.entry() for choice in stages.choices],
             "solid": found.collapse.model.solid.entry(),

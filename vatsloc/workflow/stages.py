@@ -10,13 +10,12 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
-
-from poro.errors import SolverError
-from vatsloc.errors import InputRefused, NotConverged
+from vatsloc.errors import as_ours
 from vatsloc.workflow.choices import Choice
 
 Say = Callable[[str], None]
+CT, INFLATED, DEFLATED = "CT", "inflated CBCT", "deflated CBCT"
+"""What the images are called in sentences."""
 
 
 def quiet(_message: str) -> None:
@@ -37,27 +36,42 @@ class Stages:
     choices: list[Choice] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     _start: float = field(default_factory=time.perf_counter)
+    _where: str = "The command"
+    _image: str = ""
 
     @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
+    def stage(self, name: str, image: str = "") -> Iterator[None]:
         """Time a block as the stage `name` and note the highest memory while it ran.
 
-        Numerics refuse what they cannot work with by a ValueError; it leaves as InputRefused that names the stage. A
-        linear solver without an answer raises SolverError, numpy's LinAlgError; they leave as NotConverged.
+        Whatever is raised inside leaves as one of the program's own errors that names the stage, and the image where
+        the block works on one or says so by `on`.
         """
         self.say(f"{name} ...")
+        self._where, self._image = f"The stage '{name}'", image
         reset = _reset_peak()
         start, start_cpu = time.perf_counter(), time.process_time()
-        try:
+        with self.named():
             yield
-        except (SolverError, np.linalg.LinAlgError) as error:  # the latter is a ValueError too
-            raise NotConverged(f"The stage '{name}' has no answer: {error}; try another [mesh] edge_mm.") from error
-        except ValueError as error:
-            raise InputRefused(f"The stage '{name}' cannot work with these images: {error}.") from error
         self.seconds[name] = round(time.perf_counter() - start, 3)
         self.cpu_seconds[name] = round(time.process_time() - start_cpu, 3)
         self.peak_mb[name] = round(_peak_mb(reset), 1)
+        self._where, self._image = f"What follows the stage '{name}'", ""
         self.say(f"{name}: {self.seconds[name]:.1f} s")
+
+    def on(self, image: str) -> None:
+        """Say which image the stage at work looks at from here on."""
+        self._image = image
+
+    @contextmanager
+    def named(self) -> Iterator[None]:
+        """What is raised inside leaves as one of the program's own errors that names the last stage and its image."""
+        try:
+            yield
+        except Exception as error:
+            ours = as_ours(error, self._where, self._image)
+            if ours is error:
+                raise
+            raise ours from error
 
     def skip(self, name: str, why: str) -> None:
         """Note that the stage `name` was left out."""
