@@ -24,6 +24,7 @@ from vatsloc.imaging.airways import TrackedAirways
 from vatsloc.imaging.cbct import Cupping, FieldOfView, PreparedCbct
 from vatsloc.imaging.lungs import Lungs
 from vatsloc.imaging.pleura import Pneumothorax
+from vatsloc.imaging.side import PleuralGas
 from vatsloc.imaging.spine import Spine
 from vatsloc.imaging.surface import Border, SurfacePoints
 from vatsloc.workflow.prepare import Prepared
@@ -154,7 +155,8 @@ def prepared(usable_inflated: Array | None = None, usable_deflated: Array | None
         bone.inside[number, 0, 0] = True
         spines.append(Spine(bone, np.zeros((1, 3)), 300.0))
     lungs = Lungs(other, lung, airways, 0.0, {})
-    return Prepared(lungs, lung, cbct(inflated(), usable_inflated), cbct(deflated(), usable_deflated), *spines)
+    gas = PleuralGas({"left": 1.0, "right": 2.0}, {"left": 3.0, "right": 400.0})
+    return Prepared(lungs, lung, cbct(inflated(), usable_inflated), cbct(deflated(), usable_deflated), *spines, gas)
 
 
 def rigid_fit(moving_from_fixed: RigidTransform) -> RigidFit:

@@ -32,6 +32,7 @@ from registration.terms.gauss_newton import Stop
 from registration.volume import Array, Grid, Mask, Volume
 from vatsloc.case import Case, Hints, Nodule
 from vatsloc.imaging.cbct import Cupping, FieldOfView, PreparedCbct
+from vatsloc.imaging.side import PleuralGas
 from vatsloc.imaging.surface import Border, SurfacePoints
 from vatsloc.workflow.hilum import HilumMotion, HilumSource
 from vatsloc.workflow.ladder import Model
@@ -219,6 +220,9 @@ def cbct(grid: Grid, usable: Mask, hu: float) -> PreparedCbct:
     return PreparedCbct(Volume(np.full(grid.shape, hu, np.float32), grid.ras_from_ijk), seen, removed)
 
 
+GAS = PleuralGas({"left": 5.0, "right": 6.0}, {"left": 7.0, "right": 800.0})
+
+
 def _prepared() -> Prepared:
     unused: Any = None
     return Prepared(
@@ -229,6 +233,7 @@ def _prepared() -> Prepared:
         spine_ct=unused,
         spine_inflated=unused,
         spine_deflated=unused,
+        gas=GAS,
     )
 
 
