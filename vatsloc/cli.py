@@ -82,8 +82,8 @@ def cohort(
     as_json: JsonOption = False,
 ) -> None:
     """Localize and score many cases; one table of errors, gates, seconds and memory as CSV, Markdown and HTML."""
-    from vatsloc.study.cohort import as_json as cohort_json
-    from vatsloc.study.cohort import find_cases, run_cohort, table
+    from vatsloc.study.cohort.cohort import as_json as cohort_json
+    from vatsloc.study.cohort.cohort import find_cases, run_cohort, table
     from vatsloc.workflow.settings import load_settings
 
     load_settings(preset, settings)
@@ -127,10 +127,10 @@ def phantom(
 ) -> None:
     """Write a synthetic case with known truth, the whole suite with a table of how hard its cases are, or the twin of a
     scan: collapsed, or breathing."""
-    from vatsloc.phantom_case import side_named, write_phantom, write_twin
-    from vatsloc.phantom_series import write_series
-    from vatsloc.study.contact_sheet import write_sheet
-    from vatsloc.study.suite import table, write_suite
+    from vatsloc.study.cohort.cohort.contact_sheet import write_sheet
+    from vatsloc.study.cohort.suite import table, write_suite
+    from vatsloc.synthetic.case import side_named, write_phantom, write_twin
+    from vatsloc.synthetic.series import write_series
 
     moving = side_named(side)
     if suite is not None and (name, out, from_ct) == (None, None, None):
@@ -162,7 +162,7 @@ def demo(
 ) -> None:
     """Make a phantom, localize its nodule with the fast preset, score it and say where the report is."""
     from vatsloc.evaluation import evaluate_case, table
-    from vatsloc.phantom_case import write_phantom
+    from vatsloc.synthetic.case import write_phantom
     from vatsloc.workflow.run import run_case
     from vatsloc.workflow.settings import load_settings
 
@@ -187,9 +187,9 @@ def chart(
     ] = "seconds",
 ) -> None:
     """Errors against seconds of the method's variants over CASES; goes on where it was stopped (extra "report")."""
-    from vatsloc.study.chart import run_chart
-    from vatsloc.study.chart_draw import require_matplotlib, write_chart
-    from vatsloc.study.chart_variants import VARIANTS, chosen_variants
+    from vatsloc.study.chart.chart import run_chart
+    from vatsloc.study.chart.chart.draw import require_matplotlib, write_chart
+    from vatsloc.study.chart.chart.variants import VARIANTS, chosen_variants
 
     require_matplotlib()
     chosen = chosen_variants([name.strip() for name in variants.split(",")] if variants else None)
@@ -206,10 +206,10 @@ def paper(
     jobs: Annotated[int, typer.Option(metavar="N", min=1, help="Cases run at once.")] = 1,
 ) -> None:
     """The experiments of Alvarez 2021 on cases with truth: variants A to C, diaphragm, parameters (extra "report")."""
-    from vatsloc.study.chart_draw import require_matplotlib
-    from vatsloc.study.cohort import find_cases
-    from vatsloc.study.paper import run_paper
-    from vatsloc.study.paper_draw import write_paper
+    from vatsloc.study.chart.chart.draw import require_matplotlib
+    from vatsloc.study.cohort.cohort import find_cases
+    from vatsloc.study.paper.paper import run_paper
+    from vatsloc.study.paper.paper.draw import write_paper
 
     require_matplotlib()
     write_paper(run_paper(find_cases(folders), out, jobs, say), out)

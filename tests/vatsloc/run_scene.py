@@ -34,7 +34,7 @@ from vatsloc.case import Case, Hints, Nodule
 from vatsloc.imaging.cbct import Cupping, FieldOfView, PreparedCbct
 from vatsloc.imaging.surface import Border, SurfacePoints
 from vatsloc.workflow.hilum import HilumMotion, HilumSource
-from vatsloc.workflow.ladder import Model
+from vatsloc.workflow.model_selection import Model
 from vatsloc.workflow.observe import Observed
 from vatsloc.workflow.pneumothorax import Collapse
 from vatsloc.workflow.pose import ChangeOfPose

@@ -16,8 +16,8 @@ from registration.maps.composite import CompositeTransform
 from registration.maps.rigid import RigidTransform
 from registration.sliding import SlidingFit, moved_mm
 from registration.terms.gauss_newton import Stop
-from vatsloc.phantom_case import write_phantom
-from vatsloc.study.choices import LIMITS, Tried, table, try_choices
+from vatsloc.study.stability.choices import LIMITS, Tried, table, try_choices
+from vatsloc.synthetic.case import write_phantom
 from vatsloc.workflow.choices import Choice, weigh
 from vatsloc.workflow.pneumothorax import RESIDUAL
 from vatsloc.workflow.pose import FIRST, extrapolated, moved_far

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from vatsloc.study.paper.paper.draw import page
 
 from vatsloc.errors import InputRefused
-from vatsloc.study import paper
-from vatsloc.study.paper import CaseRuns, Run, read_runs, run_paper, settings_for
-from vatsloc.study.paper_draw import page
+from vatsloc.study.paper import paper
+from vatsloc.study.paper.paper import CaseRuns, Run, read_runs, run_paper, settings_for
 
 
 def runs(case: str = "one") -> CaseRuns:

@@ -18,9 +18,9 @@ from vatsloc.study import bench_poro as bench
 from vatsloc.study import cost_poro as cost
 from vatsloc.study import stability_poro as stability
 from vatsloc.study import stability_poro_mesh as stability_mesh
-from vatsloc.study.getfem_peer import getfem_python
-from vatsloc.study.poro_lung import HILUM_CENTRE, RADII_MM, lung, smooth_wall, system_of, wall_level
-from vatsloc.study.stability_poro_mesh import with_slivers
+from vatsloc.study.bench.getfem_peer import getfem_python
+from vatsloc.study.bench.poro_lung import HILUM_CENTRE, RADII_MM, lung, smooth_wall, system_of, wall_level
+from vatsloc.study.stability.poro_mesh import with_slivers
 from vatsloc.study.tables import Row, markdown
 
 

@@ -20,9 +20,9 @@ from registration.volume import Array, Mask, Volume
 from vatsloc.frames import flip_points
 from vatsloc.imaging.cbct import PreparedCbct
 from vatsloc.maps import MeshMap, covered, sampled
-from vatsloc.workflow.certainty import CHECK_REACH_MM
 from vatsloc.workflow.gates import Gate, at_least, at_most
 from vatsloc.workflow.settings import GateSettings
+from vatsloc.workflow.uncertainty import CHECK_REACH_MM
 
 VOXEL_MM, MAP_MM = 2.0, 4.0
 RIM_MM = 3.0

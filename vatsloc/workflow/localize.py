@@ -18,7 +18,6 @@ from vatsloc.case import Case
 from vatsloc.errors import NotConverged
 from vatsloc.imaging.surface import Border
 from vatsloc.maps import MeshMap
-from vatsloc.workflow.certainty import covariance
 from vatsloc.workflow.check import VOXEL_MM, Checks, check_gates, compare
 from vatsloc.workflow.gates import Gate, at_least, at_most
 from vatsloc.workflow.hilum import HilumSource
@@ -27,6 +26,7 @@ from vatsloc.workflow.pose import ChangeOfPose, change_of_pose
 from vatsloc.workflow.prepare import Prepared, prepare
 from vatsloc.workflow.settings import GateSettings, Settings
 from vatsloc.workflow.stages import Stages
+from vatsloc.workflow.uncertainty import covariance
 
 
 @dataclass(frozen=True)
@@ -162,9 +162,9 @@ def quality_gates(pose: ChangeOfPose, collapse: Collapse, limits: GateSettings) 
         gates["registration_folds"] = at_most(
             folded, limits.max_folded_share, "The registration of phase 1 folds space."
         )
-    if collapse.model.held_back_mm is not None:
-        gates["held_back"] = at_most(
-            collapse.model.held_back_mm, limits.max_held_back_mm, "The model does not predict places it has not seen."
+    if collapse.model.held_out_mm is not None:
+        gates["held_out"] = at_most(
+            collapse.model.held_out_mm, limits.max_held_out_mm, "The model does not predict places it has not seen."
         )
     if collapse.residual is not None:
         gates["agreement"] = at_least(

@@ -23,14 +23,14 @@ from vatsloc.report.collect import report_data
 from vatsloc.report.data import LUNG, SURFACE, Outline, Picture
 from vatsloc.report.render import write_report
 from vatsloc.results import OUTPUT_FILES, RADIUS95, REPORT, SCENE, ResultData, RunRecord, write_results
-from vatsloc.scene import write_result_scene
-from vatsloc.workflow.certainty import radius95, scatter
+from vatsloc.slicer_scene import write_result_scene
 from vatsloc.workflow.localize import Localization, localize, surface_distances
 from vatsloc.workflow.pneumothorax import contact_surface
 from vatsloc.workflow.pose import ChangeOfPose
 from vatsloc.workflow.residual import Residual
 from vatsloc.workflow.settings import Settings
 from vatsloc.workflow.stages import Say, Stages, quiet
+from vatsloc.workflow.uncertainty import radius95, scatter
 
 FIELD_MARGIN_MM = 10.0
 BALL_MM = 5.0
@@ -216,9 +216,9 @@ def _residuals(found: Localization) -> dict[str, Any]:
             "identifiability": collapse.identifiability.entry(),
             "volume_ratio": collapse.mesh_after.volumes.sum() / collapse.mesh_before.volumes.sum(),
         },
-        "keypoints": {"found": len(collapse.model.pairs), "held_back_mm": collapse.model.held_back_mm},
-        "other_answers": {"number": len(collapse.model.others), "rms_mm_at_nodule": _scatter_mm(found)},
-        "ladder": [asdict(rung) for rung in collapse.model.rungs],
+        "keypoints": {"found": len(collapse.model.pairs), "held_out_mm": collapse.model.held_out_mm},
+        "perturbation_ensemble": {"number": len(collapse.model.others), "rms_mm_at_nodule": _scatter_mm(found)},
+        "ladder": [asdict(refinement) for refinement in collapse.model.refinements],
         "residual_registration": _corrected(collapse.residual),
         "surface_mm": {f"p{share}": np.percentile(surface_distances(collapse), share) for share in (50, 75, 90, 95)},
         "mesh": {"tetrahedra": len(pose.mesh_ct.tets), "model_tetrahedra": len(collapse.system.mesh.tets)},

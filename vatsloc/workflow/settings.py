@@ -40,7 +40,7 @@ class MeshSettings(_Table):
 
 
 class ModelSettings(_Table):
-    """Phase 2. cost: "plain" is the paper's; hilum, diaphragm: its variants leave one out; regional, correct: rungs
+    """Phase 2. cost: "plain" is the paper's; hilum, diaphragm: its variants leave one out; regional, correct: refinements
     beyond the paper, tried where keypoints can say whether they help.
     """
 
@@ -106,7 +106,7 @@ class GateSettings(_Table):
     max_fissure_share: float = 0.1
     min_agreement: float = 0.5
     max_model_error_mm: float = 10.0
-    max_held_back_mm: float = 5.0
+    max_held_out_mm: float = 5.0
     max_ellipsoid_mm: float = 15.0
     max_out_of_view_mm: float = 10.0
     max_left_over_mm: float = 4.0

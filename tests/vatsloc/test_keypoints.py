@@ -1,0 +1,130 @@
+"""Places inside the lung in the right frames, and both cone-beam CTs side by side."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from registration.correspondences import Correspondences
+from registration.volume import Array
+from tests.vatsloc import ball_scene as scene
+from vatsloc.maps import MeshMap
+from vatsloc.workflow import keypoints as places
+from vatsloc.workflow.keypoints import find_correspondences
+from vatsloc.workflow.settings import KeypointSettings
+from vatsloc.workflow.view import view_of
+
+INFLATED = scene.placed(scene.lung_mesh(), scene.INF_FROM_CT)
+BEFORE = scene.placed(scene.lung_mesh(), scene.INF_FROM_CT, scene.DEF_FROM_INF)
+TRUTH = scene.collapsed(BEFORE.points)
+PLANE_INF, PLANE_DEF = scene.CENTRE_INF[0] + 20.0, scene.CENTRE_DEF[2] + 18.0
+
+
+@pytest.fixture
+def observed() -> Any:
+    """The model's mesh is another one than the lung's."""
+    coarse = scene.placed(scene.lung_mesh(14.0), scene.INF_FROM_CT, scene.DEF_FROM_INF)
+    return SimpleNamespace(
+        model_mesh=coarse, mesh_before=BEFORE, def_from_inf_rigid=scene.DEF_FROM_INF, found=scene.pneumothorax()
+    )
+
+
+def half_seen() -> Any:
+    """Each scan sees the lung up to a plane of its own."""
+    return scene.prepared(
+        scene.inflated().grid.points()[..., 0] < PLANE_INF, scene.deflated().grid.points()[..., 2] < PLANE_DEF
+    )
+
+
+def depth_before(points: Array) -> Array:
+    return scene.RADIUS_MM - np.linalg.norm(points - scene.CENTRE_DEF, axis=1)
+
+
+def test_places_lie_before_the_collapse_where_the_spine_puts_them_and_after_it_where_they_went(observed: Any) -> None:
+    model = 0.6 * (scene.collapsed(observed.model_mesh.points) - observed.model_mesh.points)
+    pairs = find_correspondences(half_seen(), observed, model, KeypointSettings(reach_mm=8.0))
+    assert len(pairs) > 70
+    error = np.linalg.norm(scene.collapsed(pairs.moving) - pairs.fixed, axis=1)
+    assert np.median(error) < 0.8
+    assert np.percentile(error, 95) < 2.0
+    assert depth_before(pairs.moving).min() > 0
+    assert scene.DEF_FROM_INF.inverse()(pairs.moving)[:, 0].max() < PLANE_INF + 2.5
+    assert pairs.fixed[:, 2].max() < PLANE_DEF + 2.5
+
+
+def test_spreading_gets_both_images_in_one_frame_and_the_lung_of_each(
+    observed: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    warped = scene.CENTRE_DEF + np.random.default_rng(1).uniform(-18, 18, (30, 3))
+    second = warped + np.array([1.0, 2.0, 3.0])
+    model = 0.6 * (scene.collapsed(observed.model_mesh.points) - observed.model_mesh.points)
+    matched: dict[str, Any] = {}
+    grown: dict[str, Any] = {}
+
+    def match(first: Any, other: Any, region: Any, settings: Any, first_region: Any) -> Correspondences:
+        matched.update(first=first, second=other, region=region, settings=settings, first_region=first_region)
+        return Correspondences.of(second, warped, ncc=np.linspace(0.7, 0.9, 30))
+
+    def spread(
+        first: Any, other: Any, before: Any, after: Any, pairs: Correspondences, settings: Any
+    ) -> Correspondences:
+        grown.update(first=first, second=other, before=before, after=after, settings=settings)
+        return pairs
+
+    monkeypatch.setattr(places, "match_keypoints", match)
+    monkeypatch.setattr(places, "grow", spread)
+    pairs = find_correspondences(half_seen(), observed, model, KeypointSettings(voxel_mm=2.0, reach_mm=9.0))
+    # The model takes 60 % of an affine collapse: its inverse is affine too.
+    gradient = np.eye(3) + 0.6 * (scene.SQUEEZE - np.eye(3))
+    before = scene.CENTRE_DEF + (warped - scene.CENTRE_DEF - 0.6 * scene.SHIFT_MM) @ np.linalg.inv(gradient).T
+    assert_allclose(pairs.moving, before, atol=1e-6)
+    assert_allclose(pairs.fixed, second)
+    assert_allclose(pairs.ncc, np.linspace(0.7, 0.9, 30))
+    assert matched["settings"].voxel_mm == 2.0
+    assert matched["settings"].reach_mm == 9.0
+    assert grown["settings"].match == matched["settings"]
+    # Tissue in the region of the modelled and of the observed lung.
+    for region, expanded in (
+        (
+            matched["first_region"],
+            lambda x: scene.CENTRE_DEF + (x - scene.CENTRE_DEF - 0.6 * scene.SHIFT_MM) @ np.linalg.inv(gradient).T,
+        ),
+        (matched["region"], scene.expanded),
+    ):
+        points = region.grid.points()[region.inside]
+        assert -2.0 < depth_before(expanded(points)).min() < 1.0
+    corner = grown["first"].grid.to_ras(np.zeros((1, 3)))
+    size = (np.array(scene.inflated().hu.shape) - 1.0) * scene.SPACING_MM / 2
+    assert_allclose(scene.DEF_FROM_INF.inverse()(corner)[0], scene.CENTRE_INF - size, atol=3.0)
+    points = grown["before"].grid.points()[grown["before"].inside]
+    assert 1.0 < depth_before(points).min() < 4.0
+    assert PLANE_INF - 4.0 < scene.DEF_FROM_INF.inverse()(points)[:, 0].max() < PLANE_INF + 2.0
+    points = grown["after"].grid.points()[grown["after"].inside]
+    assert 1.0 < depth_before(scene.expanded(points)).min() < 4.0
+    assert PLANE_DEF - 4.0 < points[:, 2].max() < PLANE_DEF + 2.0
+    assert points[:, 2].min() < PLANE_DEF - 30.0
+
+
+def test_under_the_right_map_both_images_show_the_same(observed: Any) -> None:
+    view = view_of(half_seen(), scene.lung_deflated(), MeshMap(INFLATED, TRUTH, scene.DEF_FROM_INF), 2.0)
+    assert np.corrcoef(view.warped.hu[view.lung.inside], view.deflated.hu[view.lung.inside])[0, 1] > 0.9
+    assert (view.lung.inside == view.modelled.inside).mean() > 0.985
+    points = view.both_see.grid.points()
+    back = scene.DEF_FROM_INF.inverse()(scene.expanded(points[view.lung.inside]))
+    assert back[:, 0].max() < PLANE_INF + 2.5
+    assert points[view.lung.inside][:, 2].max() < PLANE_DEF + 1.1
+    assert_array_equal(view.lung.inside & ~view.both_see.inside, False)
+    assert_array_equal(view.modelled.inside & ~view.both_see.inside, False)
+    inner = np.random.default_rng(5).uniform(-15, 15, (20, 3)) + scene.CENTRE_DEF
+    assert_allclose(view.inf_from_def(inner), scene.DEF_FROM_INF.inverse()(scene.expanded(inner)), atol=0.05)
+
+
+def test_the_modelled_lung_is_the_moved_mesh(observed: Any) -> None:
+    view = view_of(scene.prepared(), scene.lung_deflated(), MeshMap(INFLATED, BEFORE.points, scene.DEF_FROM_INF), 2.0)
+    points = view.modelled.grid.points()[view.modelled.inside]
+    assert_allclose(points.mean(axis=0), scene.CENTRE_DEF, atol=0.3)
+    assert view.modelled.inside.sum() * 8 == pytest.approx(BEFORE.volumes.sum(), rel=0.02)

@@ -1,0 +1,1 @@
+"""Synthetic cases: phantoms and twins written as case folders, collapsed or breathing."""
