@@ -7,12 +7,17 @@ affine map, which leaves air where it was. All images show one pattern, so that 
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
 from poro.mesh import TetMesh, stuff_level_set
+from registration.maps.bspline import BSplineField
+from registration.maps.composite import CompositeTransform
 from registration.maps.rigid import RigidTransform
+from registration.sliding import SlidingFit
 from registration.spine import RigidFit, RigidStatus
+from registration.terms.gauss_newton import Stop
 from registration.volume import Array, Grid, Mask, Volume
 from tests.registration.scenes import make_pattern
 from vatsloc.imaging.airways import TrackedAirways
@@ -155,6 +160,12 @@ def prepared(usable_inflated: Array | None = None, usable_deflated: Array | None
 def rigid_fit(moving_from_fixed: RigidTransform) -> RigidFit:
     """A spine registration that found this pose."""
     return RigidFit(moving_from_fixed, RigidStatus.FOUND, 0.9, 0.5, 24.0, 1.0)
+
+
+def sliding_fit(matched: int, moved_mm: float, moving_from_fixed: Any = None) -> SlidingFit:
+    """A registration of the lung of which only its map, by default the identity, and what it began with count."""
+    still = CompositeTransform(RigidTransform.identity(), BSplineField(np.zeros((4, 4, 4, 3)), np.eye(4)))
+    return SlidingFit(moving_from_fixed or still, Stop.CONVERGED, (), 1.0, 0.0, 1.0, matched, moved_mm, True)
 
 
 def air_surface(count: int = 600) -> SurfacePoints:

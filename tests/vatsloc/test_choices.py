@@ -11,11 +11,8 @@ import pytest
 from phantoms.cbct import Scanner
 from phantoms.spec import SPECS, Collapse, Lesion, PhantomSpec
 from registration.correspondences import Correspondences
-from registration.maps.bspline import BSplineField
-from registration.maps.composite import CompositeTransform
-from registration.maps.rigid import RigidTransform
-from registration.sliding import SlidingFit, moved_mm
-from registration.terms.gauss_newton import Stop
+from registration.sliding import moved_mm
+from tests.vatsloc.ball_scene import sliding_fit
 from vatsloc.study.stability.choices import LIMITS, Tried, table, try_choices
 from vatsloc.synthetic.case import write_phantom
 from vatsloc.workflow.choices import Choice, weigh
@@ -79,12 +76,6 @@ def test_places_that_moved_little_against_the_spine_make_the_first_registration_
     none = sliding_fit(0, moved_mm(None, spine))
     assert moved_far(none, 100.0).kept
     assert moved_far(none, 100.0).value == inf
-
-
-def sliding_fit(matched: int, moved: float) -> SlidingFit:
-    """A fit of which only what it began with counts."""
-    still = CompositeTransform(RigidTransform.identity(), BSplineField(np.zeros((4, 4, 4, 3)), np.eye(4)))
-    return SlidingFit(still, Stop.CONVERGED, (), 1.0, 0.0, 1.0, matched, moved, True)
 
 
 def test_extrapolation_goes_where_no_node_is_out_of_view() -> None:

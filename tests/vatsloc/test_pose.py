@@ -11,6 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from registration.correspondences import Correspondences
 from registration.maps.inversion import Inversion, invert_at
+from registration.sliding import moved_mm
 from registration.volume import Array, Mask
 from tests.vatsloc import ball_scene as scene
 from vatsloc.errors import InputRefused
@@ -25,7 +26,7 @@ from vatsloc.workflow.pose import (
     change_of_pose,
     extrapolated,
     ffd_settings,
-    is_far,
+    moved_far,
 )
 from vatsloc.workflow.settings import settings_of
 from vatsloc.workflow.stages import Stages
@@ -56,6 +57,7 @@ class Watched:
         self.prepared, self.stages, self.asked = scene.prepared(usable), Stages(), dict[str, tuple[Any, ...]]()
         self.case: Any = SimpleNamespace(ct=scene.ct(), side="right", hints=hints)
         self.prior, self.lung_inf = object(), scene.empty(scene.inflated())
+        self.fit: Any = scene.sliding_fit(50, 0.0, moved_back)
         for name, answer in (
             ("register_spine", scene.rigid_fit(CT_FROM_INF)),
             ("carry_prior", self.prior),
@@ -71,7 +73,7 @@ class Watched:
         return ask
 
     def run(self, **tables: Any) -> ChangeOfPose:
-        register = self._asked("register", SimpleNamespace(moving_from_fixed=moved_back))
+        register = self._asked("register", self.fit)
         return change_of_pose(
             self.case, self.prepared, settings_of("balanced", COARSE, tables), self.stages, register=register
         )
@@ -108,11 +110,11 @@ def test_the_lung_is_registered_inflated_to_ct_from_the_spines_pose(watched: Wat
     assert named["fixed_lung"] is watched.lung_inf is found.lung_inf
     assert named["seen"] is watched.prepared.inflated.field.usable
     assert_allclose(named["prior"].matrix, CT_FROM_INF.matrix)
-    places = scene.CENTRE_INF + np.random.default_rng(1).uniform(-20, 20, (50, 3))
-    still = Correspondences(places, CT_FROM_INF(places), np.ones(50))
-    assert named["is_far"](still)  # 0 mm, but balanced keeps the first registration in every case
-    assert [(choice.part, choice.limit) for choice in watched.stages.choices if choice.part == FIRST] == [(FIRST, -1.0)]
-    assert watched.stages.choices[-1].value == pytest.approx(0.0, abs=1e-9)
+    assert named["coarse_beyond_mm"] == -1.0
+    (choice,) = (choice for choice in watched.stages.choices if choice.part == FIRST)
+    # 0 mm, but balanced keeps the first registration in every case.
+    assert (choice.kept, choice.value, choice.limit) == (True, 0.0, -1.0)
+    assert found.ffd is watched.fit
 
 
 def test_seen_nodes_go_where_the_inverted_field_says_and_the_others_go_on_smoothly(watched: Watched) -> None:
@@ -241,25 +243,31 @@ def test_a_vertebra_marked_in_both_images_starts_the_search_there_and_narrows_it
 
 
 @pytest.mark.parametrize(("limit", "far"), [(9.0, True), (11.0, False)])
-def test_places_are_far_where_95_percent_moved_by_more_than_the_limit_against_the_prior(
-    limit: float, far: bool
+def test_matches_are_far_where_95_percent_moved_by_more_than_the_limit_against_the_prior(
+    watched: Watched, limit: float, far: bool
 ) -> None:
     fixed = np.random.default_rng(2).uniform(-30, 30, (100, 3))
     off = np.where(np.arange(100) < 90, 10.0, 0.0)
     off[:4] = 500.0  # fewer than 5 %
-    places = Correspondences(fixed, CT_FROM_INF(fixed) + off[:, None] * np.array([0, 0, 1.0]), np.ones(100))
-    stages = Stages()
-    assert is_far(CT_FROM_INF, limit, stages, places) is far
-    (choice,) = stages.choices
-    assert (choice.part, choice.kept) == (FIRST, far)
+    matches = Correspondences.of(fixed, CT_FROM_INF(fixed) + off[:, None] * np.array([0, 0, 1.0]))
+    watched.fit = scene.sliding_fit(100, moved_mm(matches, CT_FROM_INF), moved_back)
+    watched.run(leave_out={"first_registration_mm": limit})
+    assert watched.asked["register"][-1]["coarse_beyond_mm"] == limit
+    (choice,) = (choice for choice in watched.stages.choices if choice.part == FIRST)
+    assert (choice.kept, choice.limit) == (far, limit)
     assert choice.value == pytest.approx(10.0)
-    assert (FIRST in stages.skipped) is not far
+    assert (FIRST in watched.stages.skipped) is not far
 
 
-def test_without_places_the_start_is_taken_to_be_far() -> None:
-    stages = Stages()
-    assert is_far(CT_FROM_INF, 1000.0, stages, None)
-    assert stages.choices[0].value == np.inf
+def test_without_matches_the_start_is_taken_to_be_far() -> None:
+    choice = moved_far(scene.sliding_fit(0, moved_mm(None, CT_FROM_INF)), 1000.0)
+    assert (choice.kept, choice.value) == (True, np.inf)
+
+
+def test_a_registration_without_coarse_levels_of_its_own_leaves_no_choice(watched: Watched) -> None:
+    watched.fit = SimpleNamespace(moving_from_fixed=moved_back)
+    watched.run()
+    assert [choice.part for choice in watched.stages.choices] == [EXTRAPOLATION]
 
 
 def test_motion_is_continued_where_a_node_is_out_of_view() -> None:
