@@ -127,7 +127,7 @@ def phantom(
 ) -> None:
     """Write a synthetic case with known truth, the whole suite with a table of how hard its cases are, or the twin of a
     scan: collapsed, or breathing."""
-    from vatsloc.study.cohort.cohort.contact_sheet import write_sheet
+    from vatsloc.study.cohort.contact_sheet import write_sheet
     from vatsloc.study.cohort.suite import table, write_suite
     from vatsloc.synthetic.case import side_named, write_phantom, write_twin
     from vatsloc.synthetic.series import write_series
@@ -188,8 +188,8 @@ def chart(
 ) -> None:
     """Errors against seconds of the method's variants over CASES; goes on where it was stopped (extra "report")."""
     from vatsloc.study.chart.chart import run_chart
-    from vatsloc.study.chart.chart.draw import require_matplotlib, write_chart
-    from vatsloc.study.chart.chart.variants import VARIANTS, chosen_variants
+    from vatsloc.study.chart.draw import require_matplotlib, write_chart
+    from vatsloc.study.chart.variants import VARIANTS, chosen_variants
 
     require_matplotlib()
     chosen = chosen_variants([name.strip() for name in variants.split(",")] if variants else None)
@@ -206,10 +206,10 @@ def paper(
     jobs: Annotated[int, typer.Option(metavar="N", min=1, help="Cases run at once.")] = 1,
 ) -> None:
     """The experiments of Alvarez 2021 on cases with truth: variants A to C, diaphragm, parameters (extra "report")."""
-    from vatsloc.study.chart.chart.draw import require_matplotlib
+    from vatsloc.study.chart.draw import require_matplotlib
     from vatsloc.study.cohort.cohort import find_cases
+    from vatsloc.study.paper.draw import write_paper
     from vatsloc.study.paper.paper import run_paper
-    from vatsloc.study.paper.paper.draw import write_paper
 
     require_matplotlib()
     write_paper(run_paper(find_cases(folders), out, jobs, say), out)

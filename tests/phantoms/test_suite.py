@@ -8,7 +8,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from vatsloc.study.cohort.cohort.contact_sheet import HEIGHT, LABEL, write_sheet
 
 from phantoms import SPECS, SUITE, PhantomCase
 from phantoms.measures import affine_share
@@ -17,6 +16,7 @@ from phantoms.thorax import draw_thorax
 from vatsloc.errors import CaseError
 from vatsloc.report.planes import box_of
 from vatsloc.study.cohort import suite
+from vatsloc.study.cohort.contact_sheet import HEIGHT, LABEL, write_sheet
 from vatsloc.synthetic.case import read_info, recipe, write_phantom
 
 

@@ -34,7 +34,7 @@ from vatsloc.case import Case, Hints, Nodule
 from vatsloc.imaging.cbct import Cupping, FieldOfView, PreparedCbct
 from vatsloc.imaging.surface import Border, SurfacePoints
 from vatsloc.workflow.hilum import HilumMotion, HilumSource
-from vatsloc.workflow.model_selection import Model
+from vatsloc.workflow.model_selection import CollapseModel
 from vatsloc.workflow.observe import Observed
 from vatsloc.workflow.pneumothorax import Collapse
 from vatsloc.workflow.pose import ChangeOfPose
@@ -272,7 +272,7 @@ def _collapse(lung: TetMesh) -> Collapse:
     )
     found_again, others = Correspondences.of(nothing, nothing), np.zeros((0, *model_mesh.points.shape))
     still = np.zeros_like(model_mesh.points)
-    model = Model(system, _fit(model_mesh), still, found_again, (), solid, others)
+    model = CollapseModel(system, _fit(model_mesh), still, found_again, (), solid, others)
     return Collapse(observed, model, None, after.points)
 
 

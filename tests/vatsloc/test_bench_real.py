@@ -15,7 +15,7 @@ from poro.arrays import Array
 from poro.mesh import TetMesh
 from registration.volume import Mask
 from vatsloc.errors import CaseError, InputRefused
-from vatsloc.study import bench_real as bench
+from vatsloc.study.bench import real as bench
 from vatsloc.study.bench import real_draw
 from vatsloc.study.bench.affine import affine_to_points, affine_to_shape
 from vatsloc.study.bench.breathing import Lung

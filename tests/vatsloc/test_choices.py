@@ -72,7 +72,7 @@ def test_places_that_moved_little_against_the_spine_make_the_first_registration_
     assert not moved_far(matched, 5.1).kept
     assert moved_far(matched, 4.9).kept
     assert moved_far(matched, 5.1).value == pytest.approx(5)
-    assert moved_far(matched, 5.1).why.startswith("95 % of 100 places inside the lung moved by at most 5.0 mm")
+    assert moved_far(matched, 5.1).why.startswith("95 % of 100 keypoints inside the lung moved by at most 5.0 mm")
     none = sliding_fit(0, moved_mm(None, spine))
     assert moved_far(none, 100.0).kept
     assert moved_far(none, 100.0).value == inf

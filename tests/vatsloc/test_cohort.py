@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from vatsloc.errors import CaseError
-from vatsloc.study import bench_fit as fits
+from vatsloc.study.bench import fit as fits
 from vatsloc.study.cohort.cohort import Outcome, as_json, find_cases, run_cohort, summary, table
 
 PROGRAM = """

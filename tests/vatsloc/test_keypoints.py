@@ -16,7 +16,7 @@ from vatsloc.maps import MeshMap
 from vatsloc.workflow import keypoints as places
 from vatsloc.workflow.keypoints import find_correspondences
 from vatsloc.workflow.settings import KeypointSettings
-from vatsloc.workflow.view import view_of
+from vatsloc.workflow.warped_pair import warped_pair
 
 INFLATED = scene.placed(scene.lung_mesh(), scene.INF_FROM_CT)
 BEFORE = scene.placed(scene.lung_mesh(), scene.INF_FROM_CT, scene.DEF_FROM_INF)
@@ -110,7 +110,7 @@ def test_spreading_gets_both_images_in_one_frame_and_the_lung_of_each(
 
 
 def test_under_the_right_map_both_images_show_the_same(observed: Any) -> None:
-    view = view_of(half_seen(), scene.lung_deflated(), MeshMap(INFLATED, TRUTH, scene.DEF_FROM_INF), 2.0)
+    view = warped_pair(half_seen(), scene.lung_deflated(), MeshMap(INFLATED, TRUTH, scene.DEF_FROM_INF), 2.0)
     assert np.corrcoef(view.warped.hu[view.lung.inside], view.deflated.hu[view.lung.inside])[0, 1] > 0.9
     assert (view.lung.inside == view.modelled.inside).mean() > 0.985
     points = view.both_see.grid.points()
@@ -124,7 +124,9 @@ def test_under_the_right_map_both_images_show_the_same(observed: Any) -> None:
 
 
 def test_the_modelled_lung_is_the_moved_mesh(observed: Any) -> None:
-    view = view_of(scene.prepared(), scene.lung_deflated(), MeshMap(INFLATED, BEFORE.points, scene.DEF_FROM_INF), 2.0)
+    view = warped_pair(
+        scene.prepared(), scene.lung_deflated(), MeshMap(INFLATED, BEFORE.points, scene.DEF_FROM_INF), 2.0
+    )
     points = view.modelled.grid.points()[view.modelled.inside]
     assert_allclose(points.mean(axis=0), scene.CENTRE_DEF, atol=0.3)
     assert view.modelled.inside.sum() * 8 == pytest.approx(BEFORE.volumes.sum(), rel=0.02)

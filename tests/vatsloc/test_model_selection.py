@@ -16,13 +16,13 @@ from registration.correspondences import Correspondences
 from vatsloc.workflow.ensemble import perturbation_ensemble
 from vatsloc.workflow.model_selection import (
     NO_ENSEMBLE,
-    Model,
+    CollapseModel,
     Step,
-    best_of,
     corrected,
     fit_settings,
     held_out,
     misfit,
+    select_refinement,
 )
 from vatsloc.workflow.settings import settings_of
 
@@ -49,7 +49,7 @@ def surface(lung: TetMesh) -> Target:
 
 
 @pytest.fixture(scope="module")
-def still(lung: TetMesh) -> Model:
+def still(lung: TetMesh) -> CollapseModel:
     """A model that has not learned anything: everything stays where it is."""
     hilum = np.flatnonzero(np.linalg.norm(lung.points - [-50, 0, 0], axis=1) < 25)
     system = assemble(lung, Tissue(), np.array([1.0, 0, 0]), hilum, np.zeros((len(hilum), 3)))
@@ -57,7 +57,7 @@ def still(lung: TetMesh) -> Model:
     found: Fit = fit_collapse(system, Target(boundary.points, boundary.node_normals, np.ones(len(boundary.points))))
     nothing = np.zeros_like(lung.points)
     solid = keep_in_range(system, found.state, neo_hookean(Tissue()))
-    return Model(
+    return CollapseModel(
         system, replace(found, state=replace(found.state, u=nothing)), nothing, _pairs(), (), solid, NO_ENSEMBLE
     )
 
@@ -91,9 +91,9 @@ def test_a_quarter_is_held_back_in_whole_blocks() -> None:
 
 
 def test_a_rung_that_predicts_what_it_has_not_seen_is_taken_and_follows_all_pairs(
-    still: Model, surface: Target
+    still: CollapseModel, surface: Target
 ) -> None:
-    model, training_only = best_of(_steps(), still, still, surface)
+    model, training_only = select_refinement(_steps(), still, still, surface)
     assert sum(refinement.kept for refinement in model.refinements) == 1
     best = min(model.refinements, key=lambda refinement: refinement.after_mm)
     assert best.kept
@@ -108,19 +108,19 @@ def test_a_rung_that_predicts_what_it_has_not_seen_is_taken_and_follows_all_pair
     )
 
 
-def test_a_step_that_fails_with_all_pairs_gives_way_to_the_next_best(still: Model, surface: Target) -> None:
+def test_a_step_that_fails_with_all_pairs_gives_way_to_the_next_best(still: CollapseModel, surface: Target) -> None:
     everything = len(still.pairs)
 
-    def fails(model: Model, target: Target, start: Fit) -> Model:
+    def fails(model: CollapseModel, target: Target, start: Fit) -> CollapseModel:
         return model if len(target.inflated) == everything else corrected(0.05, FitSettings())(model, target, start)
 
-    model, _ = best_of({"fails": fails, "holds": corrected(0.0125, FitSettings())}, still, still, surface)
+    model, _ = select_refinement({"fails": fails, "holds": corrected(0.0125, FitSettings())}, still, still, surface)
     assert {refinement.name: refinement.kept for refinement in model.refinements} == {"fails": False, "holds": True}
     assert np.abs(model.displacement).max() > 1.0
 
 
 def test_the_standard_deviation_of_keypoints_in_the_settings_reaches_the_correction(
-    still: Model, surface: Target
+    still: CollapseModel, surface: Target
 ) -> None:
     """The surer they are said to be, the closer they are followed."""
     target = replace(surface, inflated=still.pairs.moving, deflated=still.pairs.fixed, keypoint_weights=np.ones(300))
@@ -132,17 +132,19 @@ def test_the_standard_deviation_of_keypoints_in_the_settings_reaches_the_correct
     assert left[0] < 0.5 * left[1]
 
 
-def test_noise_alone_is_not_worth_a_rung(still: Model) -> None:
+def test_noise_alone_is_not_worth_a_rung(still: CollapseModel) -> None:
     boundary = still.system.mesh.boundary
     stays = Target(boundary.points, boundary.node_normals, np.ones(len(boundary.points)))
     noisy = replace(still, pairs=_pairs(noise_mm=2.0, smooth=False))
-    model, training_only = best_of(_steps(), noisy, noisy, stays)
+    model, training_only = select_refinement(_steps(), noisy, noisy, stays)
     assert [refinement.kept for refinement in model.refinements] == [False, False]
     assert_allclose(model.displacement, 0)
     assert_allclose(training_only.displacement, 0)
 
 
-def test_other_answers_follow_the_inputs_and_agree_where_the_surface_tells_all(lung: TetMesh, still: Model) -> None:
+def test_other_answers_follow_the_inputs_and_agree_where_the_surface_tells_all(
+    lung: TetMesh, still: CollapseModel
+) -> None:
     system = still.system
     truth = solve(system, Theta(2e-8, 0.7, 0.0))
     boundary = lung.boundary.moved(lung.boundary.points + truth.u[lung.boundary.nodes])

@@ -15,7 +15,7 @@ from registration.correspondences import Correspondences
 from registration.volume import Array
 from tests.vatsloc import ball_scene as scene
 from vatsloc.workflow import pneumothorax as module
-from vatsloc.workflow.model_selection import Model, Refinement
+from vatsloc.workflow.model_selection import CollapseModel, Refinement
 from vatsloc.workflow.pneumothorax import RESIDUAL, Collapse, collapse, contact_surface, pneumothorax
 from vatsloc.workflow.pose import ChangeOfPose
 from vatsloc.workflow.residual import Residual
@@ -58,14 +58,14 @@ class Parts:
         system: Any = SimpleNamespace(mesh=coarse)
         nothing: Any = None
         moved = scene.collapsed(coarse.points) - coarse.points
-        self.model = Model(system, nothing, moved, self.pairs, tuple(refinements), nothing, np.zeros((0, 0, 3)))
+        self.model = CollapseModel(system, nothing, moved, self.pairs, tuple(refinements), nothing, np.zeros((0, 0, 3)))
         self.asked: list[tuple[Any, ...]] = []
 
     def run(self, monkeypatch: pytest.MonkeyPatch, images: Residual | None, **tables: Any) -> Collapse:
         case: Any = SimpleNamespace(gravity_ras=np.array([1.0, 0, 0]))
         settings = settings_of("balanced", tables)
 
-        def select_model(gravity: Array, *rest: Any) -> Model:
+        def select_model(gravity: Array, *rest: Any) -> CollapseModel:
             assert_array_equal(gravity, case.gravity_ras)
             assert rest == (self.prepared, self.observed, settings, self.stages)
             return self.model

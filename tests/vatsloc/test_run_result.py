@@ -255,7 +255,7 @@ def test_residuals_hold_each_solvers_own_numbers() -> None:
     assert_allclose(fit["identifiability"]["sigma"], np.sqrt(np.diag(known.COVARIANCE)))
     assert run["keypoints"] == {"found": 0, "held_out_mm": 3.0}
     assert run["perturbation_ensemble"] == {"number": 2, "rms_mm_at_nodule": pytest.approx(5 / np.sqrt(2))}
-    assert [refinement["name"] for refinement in run["ladder"]] == ["first", "second"]
+    assert [refinement["name"] for refinement in run["model_selection"]] == ["first", "second"]
     assert run["residual_registration"] == {
         "seen_nodes": 30,
         "agreed_share": 0.75,

@@ -20,20 +20,20 @@ from registration.correspondences import Correspondences
 from registration.volume import Array
 from tests.vatsloc import ball_scene as scene
 from vatsloc.imaging.surface import Border, SurfacePoints
-from vatsloc.workflow import ladder as module
+from vatsloc.workflow import model_selection as module
 from vatsloc.workflow.model_selection import (
     GAIN,
     NO_CORRESPONDENCES,
     NO_ENSEMBLE,
-    Model,
+    CollapseModel,
     Refinement,
     _regional,
     _too_few,
-    best_of,
     corrected,
     fit_settings,
     held_out,
     select_model,
+    select_refinement,
     surface_target,
 )
 from vatsloc.workflow.settings import settings_of
@@ -78,19 +78,19 @@ class _Fit:
 
 def a_model(
     share: float = 0.0, pairs: Correspondences | None = None, refinements: tuple[Refinement, ...] = ()
-) -> Model:
+) -> CollapseModel:
     """A model that knows a share of the collapse."""
     lung: Any = mesh()
     system: Any = SimpleNamespace(mesh=lung, gravity=GRAVITY, hilum=HILUM, tissue=None)
     u = share * motion(lung.points)
     nothing: Any = None
-    return Model(system, a_fit(u), u, pairs_of() if pairs is None else pairs, refinements, nothing, NO_ENSEMBLE)
+    return CollapseModel(system, a_fit(u), u, pairs_of() if pairs is None else pairs, refinements, nothing, NO_ENSEMBLE)
 
 
 def knows(share: float, **change: Any) -> Any:
     """A step to a model that knows a share of the collapse."""
 
-    def step(model: Model, target: Target, start: Fit) -> Model:
+    def step(model: CollapseModel, target: Target, start: Fit) -> CollapseModel:
         return replace(model, displacement=share * motion(model.system.mesh.points), **change)
 
     return step
@@ -102,9 +102,9 @@ def a_surface() -> Target:
 
 
 def test_held_back_places_are_never_shown_to_the_model_that_is_judged_by_them() -> None:
-    shown: list[tuple[Model, Target, Any]] = []
+    shown: list[tuple[CollapseModel, Target, Any]] = []
 
-    def watched(model: Model, target: Target, start: Fit) -> Model:
+    def watched(model: CollapseModel, target: Target, start: Fit) -> CollapseModel:
         shown.append((model, target, start))
         return replace(
             model, displacement=(0.7 + 0.1 * len(shown)) * motion(model.system.mesh.points), fit=a_fit(0 * u)
@@ -113,7 +113,7 @@ def test_held_back_places_are_never_shown_to_the_model_that_is_judged_by_them() 
     start = a_model(0.2)
     u, surface = start.displacement, a_surface()
     training_only = replace(start, displacement=0.5 * u, fit=a_fit(u))
-    model, trained = best_of({"step": watched}, start, training_only, surface)
+    model, trained = select_refinement({"step": watched}, start, training_only, surface)
     hidden = held_out(start.pairs.fixed)
     assert 10 < hidden.sum() < len(hidden) - 10
     (one, few, from_one), (other, every, from_other) = shown
@@ -142,7 +142,7 @@ def test_held_back_places_are_never_shown_to_the_model_that_is_judged_by_them() 
 @pytest.mark.parametrize(("left", "kept"), [(GAIN + 0.01, False), (GAIN - 0.01, True)])
 def test_a_rung_has_to_gain_five_percent(left: float, kept: bool) -> None:
     start = a_model(0.0)
-    model, training_only = best_of({"step": knows(1 - left)}, start, start, a_surface())
+    model, training_only = select_refinement({"step": knows(1 - left)}, start, start, a_surface())
     (refinement,) = model.refinements
     assert refinement.after_mm / refinement.before_mm == pytest.approx(left, abs=1e-3)
     assert refinement.kept is kept
@@ -156,7 +156,7 @@ def test_the_best_is_taken_and_where_it_does_not_settle_the_next_best() -> None:
     loose = knows(0.9, fit=a_fit(start.displacement, settled=False))
     contact = knows(0.95, fit=replace(a_fit(start.displacement), status=FitStatus.CONTACT))
     steps = {"a": knows(0.5), "b": knows(0.8), "c": loose, "d": contact, "e": knows(0.6)}
-    model, training_only = best_of(steps, start, start, a_surface())
+    model, training_only = select_refinement(steps, start, start, a_surface())
     assert [(refinement.name, refinement.kept) for refinement in model.refinements] == [
         ("a", False),
         ("b", True),
@@ -164,11 +164,11 @@ def test_the_best_is_taken_and_where_it_does_not_settle_the_next_best() -> None:
     ]
     assert_allclose(model.displacement, 0.8 * motion(start.system.mesh.points))
 
-    def only_blind(model: Model, target: Target, begin: Fit) -> Model:
+    def only_blind(model: CollapseModel, target: Target, begin: Fit) -> CollapseModel:
         whole = len(target.inflated) == len(start.pairs)
         return replace(knows(0.9)(model, target, begin), fit=a_fit(start.displacement, settled=not whole))
 
-    model, training_only = best_of({"f": only_blind, **steps}, start, start, a_surface())
+    model, training_only = select_refinement({"f": only_blind, **steps}, start, start, a_surface())
     assert [refinement.name for refinement in model.refinements if refinement.kept] == ["b"]
     assert_allclose(training_only.displacement, 0.8 * motion(start.system.mesh.points))
 
@@ -178,13 +178,13 @@ def test_rungs_add_up_and_the_last_one_kept_says_what_remains() -> None:
     assert model.held_out_mm == 4.0
     assert a_model(refinements=(Refinement("a", 5.0, 4.9, False),)).held_out_mm == 5.0
     assert a_model().held_out_mm is None
-    again, _ = best_of({"c": knows(0.9)}, model, model, a_surface())
+    again, _ = select_refinement({"c": knows(0.9)}, model, model, a_surface())
     assert [refinement.name for refinement in again.refinements] == ["a", "b", "c"]
 
 
 def test_too_few_or_too_crowded_places_judge_nothing() -> None:
     assert _too_few(pairs_of()) is None
-    assert _too_few(pairs_of(39)) == "only 39 places inside the lung were found again"
+    assert _too_few(pairs_of(39)) == "only 39 keypoints were matched inside the lung"
     many = pairs_of(2000)
     hidden, shown = np.flatnonzero(held_out(many.second)), np.flatnonzero(~held_out(many.second))
     for h, s in ((10, 30), (40, 10)):
@@ -286,7 +286,9 @@ def test_the_regional_fit_sets_stretches_and_hilum_free_and_starts_where_it_is_t
 
 
 class Climb:
-    """`select_model` with a plain fit that knows 20 % of the collapse, and corrections that know all of it when shown all."""
+    """`select_model` with a plain fit that knows 20 % of the collapse, and corrections that know all of it when shown
+    all.
+    """
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, pairs: Correspondences) -> None:
         lung = mesh()
@@ -325,7 +327,7 @@ class Climb:
 
         return ask
 
-    def run(self, **tables: Any) -> Model:
+    def run(self, **tables: Any) -> CollapseModel:
         tables = {"model": {"regional": False}, **tables}
         self.settings = settings_of("balanced", tables)
         self.prepared: Any = object()
@@ -357,7 +359,7 @@ def test_places_are_looked_for_where_the_strain_measure_that_holds_puts_them(mon
     assert settings == known.settings.keypoints
     lung = known.observed.model_mesh.points
     assert_allclose(model.displacement, motion(lung))
-    assert_allclose(model.others, -0.3 * motion(lung)[None], atol=1e-12)
+    assert_allclose(model.ensemble, -0.3 * motion(lung)[None], atol=1e-12)
     assert "perturbation_ensemble" not in known.asked
     assert [refinement.name for refinement in model.refinements] == [
         f"elastic correction, strain {s:g}" for s in (0.05, 0.025, 0.0125)
@@ -369,7 +371,7 @@ def test_places_are_looked_for_where_the_strain_measure_that_holds_puts_them(mon
     ("pairs", "tables", "skipped"),
     [
         (pairs_of(), {"keypoints": {"on": False}}, {"keypoints": "switched off in the settings"}),
-        (pairs_of(20), {}, {"regional fit": "only 20 places inside the lung were found again"}),
+        (pairs_of(20), {}, {"regional fit": "only 20 keypoints were matched inside the lung"}),
         (pairs_of(), {"model": {"regional": False, "correct": False}}, {}),
     ],
 )
@@ -382,7 +384,7 @@ def test_without_a_rung_the_plain_answer_stands_and_other_answers_say_how_sure_i
     assert model.fit.state is known.solid
     assert model.refinements == ()
     assert known.stages.skipped == skipped
-    assert_array_equal(model.others, known.others)
+    assert_array_equal(model.ensemble, known.others)
     assert known.asked["perturbation_ensemble"][2] is known.plain
-    assert len(model.pairs) == (0 if "keypoints" in skipped else len(pairs))
+    assert len(model.correspondences) == (0 if "keypoints" in skipped else len(pairs))
     assert len(NO_CORRESPONDENCES) == 0

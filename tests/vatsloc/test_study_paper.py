@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from vatsloc.study.paper.paper.draw import page
 
 from vatsloc.errors import InputRefused
 from vatsloc.study.paper import paper
+from vatsloc.study.paper.draw import page
 from vatsloc.study.paper.paper import CaseRuns, Run, read_runs, run_paper, settings_for
 
 

@@ -70,7 +70,7 @@ def test_where_registrations_placed_tissue_they_count_node_by_node() -> None:
 
 def test_nearest_places_are_those_of_the_deflated_image() -> None:
     collapse = with_places().collapse
-    places = collapse.model.pairs.fixed
+    places = collapse.model.correspondences.fixed
     distance, missed = nearest_correspondences(collapse, places[[0, 7]] + [0, 0, 1e-3])
     assert_allclose(distance, 1e-3, atol=1e-9)
     assert_allclose(missed, [0.01 * MISSED[:6].mean(), 0.01 * MISSED[2:].mean()], rtol=1e-6)
@@ -79,7 +79,7 @@ def test_nearest_places_are_those_of_the_deflated_image() -> None:
 def test_places_are_measured_from_where_the_answer_puts_a_point() -> None:
     scene = with_places()
     got = sure(scene, CT)
-    second, after = scene.collapse.model.pairs.fixed, known.DEF_FROM_CT(CT)
+    second, after = scene.collapse.model.correspondences.fixed, known.DEF_FROM_CT(CT)
     for point, before, one in zip(after, BEFORE, got, strict=True):
         far = np.linalg.norm(second - point, axis=1)
         missed = 0.01 * MISSED[np.argsort(far)[:6]].mean()

@@ -108,7 +108,7 @@ def bench_real_command(
     """Real lungs: move one breath-hold into the other by shape alone; errors at landmarks that were only scored."""
     from vatsloc.study.bench.real import bench_real, table
     from vatsloc.study.bench.real_draw import draw_real
-    from vatsloc.study.chart.chart.draw import require_matplotlib
+    from vatsloc.study.chart.draw import require_matplotlib
 
     if picture is not None:
         require_matplotlib()

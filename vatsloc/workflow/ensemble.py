@@ -1,4 +1,4 @@
-"""Answers as good as the one given: what other starts and inputs a little wrong make of the collapse."""
+"""The perturbation ensemble: the collapse fitted again from other starts and with slightly wrong inputs."""
 
 from __future__ import annotations
 
@@ -14,27 +14,27 @@ from registration.volume import Array
 
 STARTS = ((1e-10, 0.6, 5.0), (1e-6, 0.9, 15.0))
 AS_GOOD = 1.05
-"""A start counts when it ends at no more than this share of the best cost."""
+"""A fit from another start counts if its cost is at most this many times the best cost."""
 TILT_RAD = np.radians(10.0)
 HILUM_MM = 3.0
 
 
 def perturbation_ensemble(system: PoroSystem, surface: Target, best: Fit, settings: FitSettings) -> Array:
-    """How far (k, n, 3) mm from the best fit to the surface the lung ends elsewise, one row per try that settles.
+    """Displacements (k, n, 3) mm of k further fits less those of the best one; fits that do not settle are left out.
 
-    Tries: two more starts; gravity tilted by 10 degrees about two axes; the hilum 3 mm off along three; either half of
-    the surface alone.
+    Fits: from two more starts; gravity tilted by 10 degrees about two axes; the hilum 3 mm off along three; either half
+    of the surface alone.
     """
     theta = best.theta
     again = replace(settings, starts=((theta.kappa_b, theta.phi, theta.d_diaph_mm),))
     found = [fit_collapse(system, surface, replace(settings, starts=(start,))) for start in STARTS]
     found = [other for other in found if other.costs[0] <= AS_GOOD * best.costs.min()]
-    found += [fit_collapse(other, target, again) for other, target in _disturbed(system, surface)]
+    found += [fit_collapse(other, target, again) for other, target in _perturbed(system, surface)]
     settled = [other.state.u - best.state.u for other in found if other.state.status is not PoroStatus.NOT_CONVERGED]
     return np.array(settled).reshape(-1, *best.state.u.shape)
 
 
-def _disturbed(system: PoroSystem, surface: Target) -> Iterator[tuple[PoroSystem, Target]]:
+def _perturbed(system: PoroSystem, surface: Target) -> Iterator[tuple[PoroSystem, Target]]:
     across = np.linalg.svd(system.gravity[None])[2][1:]
     for axis in across:
         tilt = RigidTransform.about(np.zeros(3), TILT_RAD * axis, np.zeros(3))

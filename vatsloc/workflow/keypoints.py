@@ -1,5 +1,5 @@
-"""Places inside the lung that both cone-beam CTs show: found where a model of the collapse expects them, and from there
-on where those that were found do.
+"""Keypoints inside the lung matched between both cone-beam CTs: first about where a model of the collapse puts them,
+then by propagation from the matches to their neighbours.
 """
 
 from __future__ import annotations
@@ -15,22 +15,21 @@ from vatsloc.maps import MeshMap, covered
 from vatsloc.workflow.observe import Observed
 from vatsloc.workflow.prepare import Prepared
 from vatsloc.workflow.settings import KeypointSettings
-from vatsloc.workflow.view import view_of
+from vatsloc.workflow.warped_pair import warped_pair
 
 RIM_MM = 2.0
-"""So far from the lung's border its images show what lies beyond."""
+"""Blocks nearer than this to the lung's border also show what lies beyond it."""
 
 
 def find_correspondences(
     prepared: Prepared, observed: Observed, displacement: Array, settings: KeypointSettings
 ) -> Correspondences:
-    """Places inside the lung that both CBCTs show, looked for about where a displacement (n, 3) mm puts them, and then
-    about where those found next to them say.
+    """Keypoints of the deflated CBCT matched in the inflated one, starting from a displacement (n, 3) mm of the model.
 
     `moving` is where they lie before the collapse, placed by the spine.
     """
     match = MatchSettings(voxel_mm=settings.voxel_mm, reach_mm=settings.reach_mm)
-    expected = _expected(prepared, observed, displacement, match)
+    first = _near_model(prepared, observed, displacement, match)
     deflated, inflated = (coarsen(image.volume, match.voxel_mm) for image in (prepared.deflated, prepared.inflated))
     placed = Volume(inflated.hu, observed.def_from_inf_rigid.matrix @ inflated.ras_from_ijk)
     before = _inner(
@@ -41,17 +40,17 @@ def find_correspondences(
         resample_mask(observed.found.lung, deflated.grid),
         resample_mask(prepared.deflated.field.usable, deflated.grid).inside,
     )
-    return propagate_matches(deflated, placed, after, before, expected, PropagationSettings(match))
+    return propagate_matches(deflated, placed, after, before, first, PropagationSettings(match))
 
 
-def _expected(prepared: Prepared, observed: Observed, displacement: Array, match: MatchSettings) -> Correspondences:
-    """Places found within reach of where a displacement (n, 3) mm of the model's mesh puts them."""
+def _near_model(prepared: Prepared, observed: Observed, displacement: Array, match: MatchSettings) -> Correspondences:
+    """Keypoints matched within reach of where a displacement (n, 3) mm of the model's mesh puts them."""
     rest, rigid = observed.model_mesh, observed.def_from_inf_rigid
     before = TetMesh(rigid.inverse()(rest.points), rest.tets)
     model = MeshMap(before, rest.points + displacement, rigid)
-    view = view_of(prepared, observed.found.lung, model, match.voxel_mm)
-    pairs = match_keypoints(view.deflated, view.warped, view.lung, match, moving_region=view.modelled)
-    return pairs.mapped(moving=lambda points: rigid(model.inverse()(points)))
+    scans = warped_pair(prepared, observed.found.lung, model, match.voxel_mm)
+    found = match_keypoints(scans.deflated, scans.warped, scans.lung, match, moving_region=scans.modelled)
+    return found.mapped(moving=lambda points: rigid(model.inverse()(points)))
 
 
 def _inner(lung: Mask, seen: Array) -> Mask:

@@ -1,7 +1,7 @@
-"""The model of the collapse, in refinements of rising freedom, each kept only if places held back from it say so.
+"""The model of the collapse, selected by hold-out: a refinement is kept only if it predicts held-out keypoints better.
 
-1. The poroelastic lung, fitted to the visible surface. 2. Smooth regional stretches and the hilum's place as further
-parameters, fitted to surface and to places found again inside the lung. 3. An elastic correction that follows both.
+1. The poroelastic lung, fitted to the visible surface. 2. Uniform strains of regions and the hilum's position as
+further parameters, fitted to the surface and to keypoints inside the lung. 3. An elastic correction that follows both.
 """
 
 from __future__ import annotations
@@ -37,20 +37,20 @@ from vatsloc.workflow.settings import Settings
 from vatsloc.workflow.stages import Stages
 
 BLOCK_MM = 40.0
-"""Keypoints are held back by blocks this wide: neighbours tell nearly the same."""
+"""Keypoints are held out by blocks this wide, because neighbours move nearly alike."""
 LEAST_CORRESPONDENCES = 40
 CORRECTION_STRAINS = (0.05, 0.025, 0.0125)
 MOST_INVERTED = 0.001
 STRAIN = "finite strain"
-"""A part that the scene has a say in."""
+"""Name of the choice between linear and finite strain."""
 GAIN = 0.95
-"""A refinement has to bring the misfit below this share of the one before."""
+"""A refinement is kept if it brings the misfit at held-out keypoints below this share of what it was."""
 
 
 @dataclass(frozen=True)
 class Refinement:
-    """One step of freedom. before_mm, after_mm: median misfit at places that the step has not seen, without and with
-    it; kept: whether it was taken.
+    """A refinement that was tried. before_mm, after_mm: median misfit at the held-out keypoints, without and with it;
+    kept: whether it became part of the model.
     """
 
     name: str
@@ -60,38 +60,40 @@ class Refinement:
 
 
 @dataclass(frozen=True)
-class Model:
+class CollapseModel:
     """The collapse by mechanics. displacement: (n, 3) mm at the nodes of system.mesh, correction included.
 
-    pairs: keypoints matched in both CBCTs, in the deflated one's frame: `moving` before the collapse (placed by the
-    spine), `fixed` after it; refinements: what was tried beyond the plain fit; solid: which strain measure the plain fit
-    ended with, and why; others: (k, n, 3) mm, how far from `displacement` other answers lie: without any refinement those of
-    `perturbation_ensemble`, with one that of the model that has not seen all places.
+    correspondences: keypoints matched in both CBCTs, in the deflated one's frame: `moving` before the collapse (placed
+    by the spine), `fixed` after it; refinements: those tried beyond the plain fit; solid: which strain measure the
+    plain fit ended with, and why; ensemble: (k, n, 3) mm, what other estimates differ from `displacement` by. With a
+    refinement the other estimate is the training-only model, without one there are those of `perturbation_ensemble`.
     """
 
     system: PoroSystem
     fit: Fit
     displacement: Array
-    pairs: Correspondences
+    correspondences: Correspondences
     refinements: tuple[Refinement, ...]
     solid: StrainChoice
-    others: Array
+    ensemble: Array
 
     @property
     def held_out_mm(self) -> float | None:
-        """Median misfit at places held back from the last refinement that was kept, or from the plain fit; None untried."""
-        known = [refinement.before_mm for refinement in self.refinements[:1]] + [
-            refinement.after_mm for refinement in self.refinements if refinement.kept
-        ]
-        return known[-1] if known else None
+        """Median misfit at the held-out keypoints of the training-only model; None where no refinement was tried."""
+        if not self.refinements:
+            return None
+        kept = [refinement.after_mm for refinement in self.refinements if refinement.kept]
+        return kept[-1] if kept else self.refinements[0].before_mm
 
 
-Step = Callable[[Model, Target, Fit], Model]
-"""From a model and what to follow to a freer model; the fit is where to start from."""
+Step = Callable[[CollapseModel, Target, Fit], CollapseModel]
+"""Makes a model with a refinement from a model, the data to fit and a fit to start from."""
 
 
-def select_model(gravity: Array, prepared: Prepared, observed: Observed, settings: Settings, stages: Stages) -> Model:
-    """Fit the collapse to what was observed, refinement by refinement."""
+def select_model(
+    gravity: Array, prepared: Prepared, observed: Observed, settings: Settings, stages: Stages
+) -> CollapseModel:
+    """Fit the collapse to what was observed, and keep those refinements that predict held-out keypoints better."""
     tissue, mesh = Tissue(), observed.model_mesh
     with stages.stage("model set-up"):
         system = assemble(mesh, tissue, gravity, observed.hilum_nodes, observed.motion.displacement)
@@ -102,69 +104,77 @@ def select_model(gravity: Array, prepared: Prepared, observed: Observed, setting
         solid = keep_in_range(system, plain.state, neo_hookean(tissue), within)
     is_finite = solid.strain is Strain.FINITE
     stages.choose(Choice(STRAIN, is_finite, solid.why, solid.share, within.share))
-    start = Model(system, replace(plain, state=solid.state), solid.state.u, NO_CORRESPONDENCES, (), solid, NO_ENSEMBLE)
-    model, training_only = _rungs(start, surface, prepared, observed, settings, stages)
+    start = CollapseModel(
+        system, replace(plain, state=solid.state), solid.state.u, NO_CORRESPONDENCES, (), solid, NO_ENSEMBLE
+    )
+    model, training_only = _refined(start, surface, prepared, observed, settings, stages)
     if any(refinement.kept for refinement in model.refinements):
-        return replace(model, others=(training_only.displacement - model.displacement)[None])
-    with stages.stage("other answers"):
-        return replace(model, others=perturbation_ensemble(system, surface, plain, fit_settings(settings)))
+        return replace(model, ensemble=(training_only.displacement - model.displacement)[None])
+    with stages.stage("perturbation ensemble"):
+        return replace(model, ensemble=perturbation_ensemble(system, surface, plain, fit_settings(settings)))
 
 
-def _rungs(
-    model: Model, surface: Target, prepared: Prepared, observed: Observed, settings: Settings, stages: Stages
-) -> tuple[Model, Model]:
-    """The model with what was kept beyond the plain fit, and the one that has not seen the places held back."""
+def _refined(
+    model: CollapseModel, surface: Target, prepared: Prepared, observed: Observed, settings: Settings, stages: Stages
+) -> tuple[CollapseModel, CollapseModel]:
+    """The model with the refinements that were kept, fitted to all keypoints, and the same training-only."""
     if not settings.keypoints.on:
         stages.skip("keypoints", "switched off in the settings")
         return model, model
     with stages.stage("keypoints"):
-        model = replace(model, pairs=find_correspondences(prepared, observed, model.displacement, settings.keypoints))
-    training_only, why = model, _too_few(model.pairs)
+        found = find_correspondences(prepared, observed, model.displacement, settings.keypoints)
+        model = replace(model, correspondences=found)
+    training_only, why = model, _too_few(model.correspondences)
     if why:
         stages.skip("regional fit", why)
         return model, model
     if settings.model.regional:
         with stages.stage("regional fit"):
             steps = {"regional fit": _regional(settings)}
-            model, training_only = best_of(steps, model, training_only, surface)
+            model, training_only = select_refinement(steps, model, training_only, surface)
     if settings.model.correct:
         with stages.stage("elastic correction"):
             data = fit_settings(settings)
             steps = {f"elastic correction, strain {strain:g}": corrected(strain, data) for strain in CORRECTION_STRAINS}
-            model, training_only = best_of(steps, model, training_only, surface)
+            model, training_only = select_refinement(steps, model, training_only, surface)
     return model, training_only
 
 
-def best_of(steps: dict[str, Step], model: Model, training_only: Model, surface: Target) -> tuple[Model, Model]:
-    """Steps are first tried on the model that has not seen the hidden pairs. The one that predicts them best, if better
-    than without, is taken again with all pairs for the model proper; where that fails, the next best is.
+def select_refinement(
+    steps: dict[str, Step], model: CollapseModel, training_only: CollapseModel, surface: Target
+) -> tuple[CollapseModel, CollapseModel]:
+    """Try each step on the training-only model, which is fitted without the held-out keypoints.
+
+    The step that predicts these best, if better than without it by GAIN, is done again with all keypoints on the model
+    itself; where that does not settle, the next best one is.
     """
-    mesh, hidden = model.system.mesh, held_out(model.pairs.fixed)
-    unseen, shown = model.pairs.only(hidden), _with(surface, model.pairs.only(~hidden))
+    mesh, found = model.system.mesh, model.correspondences
+    hidden = held_out(found.fixed)
+    tested, shown = found.only(hidden), _with_keypoints(surface, found.only(~hidden))
     trials = {name: step(training_only, shown, training_only.fit) for name, step in steps.items()}
-    before = misfit(mesh, training_only.displacement, unseen)
-    after = {name: misfit(mesh, trial.displacement, unseen) for name, trial in trials.items() if _settled(trial)}
+    before = misfit(mesh, training_only.displacement, tested)
+    after = {name: misfit(mesh, trial.displacement, tested) for name, trial in trials.items() if _settled(trial)}
     best = None
     for name in sorted((name for name, mm in after.items() if mm < GAIN * before), key=lambda name: after[name]):
-        found = steps[name](model, _with(surface, model.pairs), trials[name].fit)
-        if found is not model and _settled(found):
-            best, model, training_only = name, found, trials[name]
+        refined = steps[name](model, _with_keypoints(surface, found), trials[name].fit)
+        if refined is not model and _settled(refined):
+            best, model, training_only = name, refined, trials[name]
             break
     refinements = (*model.refinements, *(Refinement(name, before, mm, name == best) for name, mm in after.items()))
     return replace(model, refinements=refinements), training_only
 
 
-def _settled(model: Model) -> bool:
+def _settled(model: CollapseModel) -> bool:
     return model.fit.status is not FitStatus.CONTACT and model.fit.state.status is not PoroStatus.NOT_CONVERGED
 
 
-def _too_few(pairs: Correspondences) -> str | None:
-    """Why pairs cannot judge a refinement; None when they can."""
-    hidden = held_out(pairs.fixed)
-    if len(pairs) < LEAST_CORRESPONDENCES:
-        return f"only {len(pairs)} places inside the lung were found again"
+def _too_few(found: Correspondences) -> str | None:
+    """Why correspondences cannot judge a refinement; None when they can."""
+    hidden = held_out(found.fixed)
+    if len(found) < LEAST_CORRESPONDENCES:
+        return f"only {len(found)} keypoints were matched inside the lung"
     if min(hidden.sum(), (~hidden).sum()) < LEAST_CORRESPONDENCES // 4:
-        return "the places found again lie too close together to hold some back"
+        return "the matched keypoints lie too close together to hold some out"
     return None
 
 
@@ -193,20 +203,20 @@ def fit_settings(settings: Settings, modes: int = 0) -> FitSettings:
     return FitSettings(plain=plain, free=free, max_steps=steps, keypoint_sigma_mm=sigma, kappa_decades=decades)
 
 
-def _with(target: Target, pairs: Correspondences) -> Target:
-    return replace(target, inflated=pairs.moving, deflated=pairs.fixed, keypoint_weights=pairs.weights)
+def _with_keypoints(target: Target, found: Correspondences) -> Target:
+    return replace(target, inflated=found.moving, deflated=found.fixed, keypoint_weights=found.weights)
 
 
-def misfit(mesh: TetMesh, displacement: Array, pairs: Correspondences) -> float:
-    """Median distance in mm between where displacements (n, 3) of a mesh put places and where they were found."""
-    moved = pairs.moving + interpolate(locate(mesh, pairs.moving), displacement)
-    return float(np.median(np.linalg.norm(moved - pairs.fixed, axis=1)))
+def misfit(mesh: TetMesh, displacement: Array, found: Correspondences) -> float:
+    """Median distance in mm between where displacements (n, 3) of a mesh put keypoints and where they were matched."""
+    moved = found.moving + interpolate(locate(mesh, found.moving), displacement)
+    return float(np.median(np.linalg.norm(moved - found.fixed, axis=1)))
 
 
 def _regional(settings: Settings) -> Step:
-    """Smooth stretches of the resting shape, and the hilum's place, as further parameters of the fit."""
+    """Uniform strains of the resting shape, and the hilum's position, as further parameters of the fit."""
 
-    def step(model: Model, target: Target, start: Fit) -> Model:
+    def step(model: CollapseModel, target: Target, start: Fit) -> CollapseModel:
         mesh, tissue = model.system.mesh, model.system.tissue
         modes = uniform_strain_modes(mesh, tissue)
         modes += hilum_modes(mesh, model.system.hilum) if settings.model.hilum else ()
@@ -222,9 +232,9 @@ def _regional(settings: Settings) -> Step:
 
 
 def corrected(strain: float, settings: FitSettings) -> Step:
-    """An elastic field on top; the model itself where that would turn more elements inside out."""
+    """An elastic field on top; the model unchanged where that would invert more elements."""
 
-    def step(model: Model, target: Target, _start: Fit) -> Model:
+    def step(model: CollapseModel, target: Target, _start: Fit) -> CollapseModel:
         mesh = model.system.mesh
         wanted = constraints_to(target, mesh, model.displacement, settings)
         found = elastic_correction(mesh, model.displacement, model.system.tissue, wanted, strain)

@@ -34,7 +34,7 @@ tissue that nothing holds there falls back towards the spine's pose: it was 3 to
 HINT_REACH_MM = 10.0
 """How far a marked vertebra may be off: less than half the distance to the next one."""
 FIRST, EXTRAPOLATION = "first registration", "extrapolation"
-"""Parts that the scene has a say in; the first is the coarse levels, led by places found far off the spine's pose."""
+"""Parts that may be left out; the first is the coarse levels, led by keypoints matched far off the spine's pose."""
 Register = Callable[..., FfdFit]
 """A registration that is called as `register_sliding` is."""
 
@@ -140,10 +140,10 @@ def change_of_pose(
 
 
 def moved_far(fit: SlidingFit, limit_mm: float) -> Choice:
-    """Whether places inside the lung moved so far that the coarse levels were needed."""
-    moved, seen = fit.moved_mm, "too few places inside the lung were found about the spine's pose"
+    """Whether keypoints inside the lung moved so far that the coarse levels were needed."""
+    moved, seen = fit.moved_mm, "too few keypoints were matched inside the lung about the spine's pose"
     if fit.matched:
-        seen = f"95 % of {fit.matched} places inside the lung moved by at most {moved:.1f} mm against the spine"
+        seen = f"95 % of {fit.matched} keypoints inside the lung moved by at most {moved:.1f} mm against the spine"
     return weigh(FIRST, moved, limit_mm, seen)
 
 

@@ -122,7 +122,7 @@ def _tetra(mesh: TetMesh, displacement: Array, pressure: Array, det_f: Array, co
 
 
 def _with_radius95(found: Localization, lung: TetraMesh) -> TetraMesh:
-    """With how sure the run is of each node."""
+    """With the 95 % radius of each node's position."""
     radius = radius95(found.pose, found.collapse, None if found.checks is None else found.checks.chain)
     return replace(lung, point_data={**lung.point_data, RADIUS95: radius})
 
@@ -197,7 +197,7 @@ def _record(case: Case, found: Localization, settings: Settings, stages: Stages)
 
 
 def _residuals(found: Localization) -> dict[str, Any]:
-    """What each solver left over, with its own word on how it ended."""
+    """Residuals of each solver, with the status that it reports."""
     pose, collapse = found.pose, found.collapse
     state, motion = collapse.fit.state, collapse.observed.motion
     return {
@@ -216,9 +216,9 @@ def _residuals(found: Localization) -> dict[str, Any]:
             "identifiability": collapse.identifiability.entry(),
             "volume_ratio": collapse.mesh_after.volumes.sum() / collapse.mesh_before.volumes.sum(),
         },
-        "keypoints": {"found": len(collapse.model.pairs), "held_out_mm": collapse.model.held_out_mm},
-        "perturbation_ensemble": {"number": len(collapse.model.others), "rms_mm_at_nodule": _scatter_mm(found)},
-        "ladder": [asdict(refinement) for refinement in collapse.model.refinements],
+        "keypoints": {"found": len(collapse.model.correspondences), "held_out_mm": collapse.model.held_out_mm},
+        "perturbation_ensemble": {"number": len(collapse.model.ensemble), "rms_mm_at_nodule": _scatter_mm(found)},
+        "model_selection": [asdict(refinement) for refinement in collapse.model.refinements],
         "residual_registration": _corrected(collapse.residual),
         "surface_mm": {f"p{share}": np.percentile(surface_distances(collapse), share) for share in (50, 75, 90, 95)},
         "mesh": {"tetrahedra": len(pose.mesh_ct.tets), "model_tetrahedra": len(collapse.system.mesh.tets)},
@@ -226,7 +226,7 @@ def _residuals(found: Localization) -> dict[str, Any]:
 
 
 def _scatter_mm(found: Localization) -> float:
-    """Root mean square distance in mm between the nodule's place and those of other answers."""
+    """Root mean square distance in mm of the nodule in the ensemble from where the result puts it."""
     point = found.collapse.def_from_inf_rigid(found.nodule_inf[None])
     return float(np.sqrt(np.trace(scatter(found.collapse, point)[0])))
 

@@ -1,4 +1,4 @@
-"""How sure a run is of where tissue went, at the nodule and everywhere else in the lung."""
+"""Uncertainty of where tissue lies after the collapse, at the nodule and everywhere else in the lung."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ REGISTRATION_MM = 0.5
 """Standard deviation per axis of one registration where it holds: a quarter of its finest voxel."""
 MODEL_ALONE_MM = 4.0
 """The same of the model without images inside the lung: 1.7 to 6.9 mm on twins and phantoms."""
-PLACES, PER_MISFIT, REACH_MM, PER_MM = 6, 1.5, 8.0, 0.15
-"""The same near places that were found again: so much per millimetre by which the answer misses the nearest six of them
-on average, and per millimetre of distance to the nearest one beyond its reach. Quantile regression (95 %) of the
+NEAREST, PER_MISFIT, REACH_MM, PER_MM = 6, 1.5, 8.0, 0.15
+"""The same near matched keypoints: PER_MISFIT for every millimetre by which the result misses the six nearest ones on
+average, and PER_MM for every millimetre beyond REACH_MM from the nearest one. Quantile regression (95 %) of the
 chain's errors at 16,000 tissue points of the three twins and of five phantoms outside the suite (adhesion 205,
 near-total-collapse 206, part-solid 207, base 208, poor-dose 209)."""
 
 
 CHECK_REACH_MM = 30.0
-"""What the run's check of itself found left over counts for tissue within this distance."""
+"""An error that the run's check of itself found counts for tissue within this distance."""
 
 
 def covariance(
@@ -34,10 +34,10 @@ def covariance(
     """Covariance (n, 3, 3) mm2 of where points (n, 3) of the inflated CBCT lie in the deflated one, given with where
     the run puts them (n, 3).
 
-    Where the images placed the tissue around a point, their registrations' errors and disagreement count; where they
-    did not, the fit's covariance and the scatter of other answers. Either way it is no surer than the places
-    found again about it allow: how far they are, and how well the answer follows them. left: what the run's check of
-    itself found left over of the chain; where that is more than the rest allows, the covariance holds it too.
+    Where the images placed the tissue around a point, it holds the registrations' errors and their disagreement; where
+    they did not, the fit's covariance and the scatter of the ensemble. Either way its standard deviation is at least
+    that of the nearest keypoints: from their distance, and from how well the result follows them. left: the error of
+    the chain that the run's check of itself found; where it lies outside the ellipsoid, the covariance is widened.
     """
     own = _covariance(pose, collapse, inflated, deflated)
     return own if left is None else widened(own, left.near(deflated, CHECK_REACH_MM))
@@ -76,28 +76,28 @@ def radius95(pose: ChangeOfPose, collapse: Collapse, left: LeftOver | None = Non
 
 
 def scatter(collapse: Collapse, points: Array) -> Array:
-    """Second moment (n, 3, 3) mm2 of other answers about the one given, at points (n, 3) before the collapse."""
-    others = collapse.model.others
-    if not len(others):
+    """Second moment (n, 3, 3) mm2 of the ensemble about the result, at points (n, 3) before the collapse."""
+    ensemble = collapse.model.ensemble
+    if not len(ensemble):
         return np.zeros((len(points), 3, 3))
     at = locate(collapse.system.mesh, points)
-    off = np.array([interpolate(at, other) for other in others])
+    off = np.array([interpolate(at, difference) for difference in ensemble])
     return np.asarray(np.einsum("oni,onj->nij", off, off) / len(off))
 
 
 def nearest_correspondences(collapse: Collapse, deflated: Array) -> tuple[Array, Array]:
-    """Distance (n,) mm from points (n, 3) of the deflated CBCT to the nearest place found again, and by how many mm
-    (n,) the answer misses the nearest few of them on average.
+    """Distance (n,) mm from points (n, 3) of the deflated CBCT to the nearest keypoint, and by how many mm (n,) the
+    result misses the nearest few of them on average.
     """
-    pairs, before = collapse.model.pairs, collapse.mesh_before
-    moved = interpolate(locate(before, pairs.moving), collapse.mesh_after.points - before.points)
-    missed = np.linalg.norm(pairs.moving + moved - pairs.fixed, axis=1)
-    distance, number = cKDTree(pairs.fixed).query(deflated, min(PLACES, len(pairs)))
+    found, before = collapse.model.correspondences, collapse.mesh_before
+    moved = interpolate(locate(before, found.moving), collapse.mesh_after.points - before.points)
+    missed = np.linalg.norm(found.moving + moved - found.fixed, axis=1)
+    distance, number = cKDTree(found.fixed).query(deflated, min(NEAREST, len(found)))
     return distance[:, 0], missed[number].mean(axis=1)
 
 
 def correspondence_sigma_mm(distance_mm: Array, misfit_mm: Array) -> Array:
-    """Standard deviation (n,) per axis of tissue so far (n,) from a place found again, of an answer that misses the
-    places about it by so much (n,).
+    """Standard deviation (n,) mm per axis of tissue at a distance (n,) from the nearest keypoint, where the result
+    misses the nearest keypoints by a misfit (n,).
     """
     return PER_MISFIT * misfit_mm + PER_MM * np.maximum(distance_mm - REACH_MM, 0.0)

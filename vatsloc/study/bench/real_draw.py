@@ -9,7 +9,7 @@ from poro.mesh import interpolate, locate
 from vatsloc.study.bench.breathing import caudal
 from vatsloc.study.bench.breaths import read_person
 from vatsloc.study.bench.real import BREATHING, EDGE_MM, ELASTIC, ROWS
-from vatsloc.study.chart.chart.draw import require_matplotlib
+from vatsloc.study.chart.draw import require_matplotlib
 
 VIEWS = ((1, 2, "from the side, front to the right"), (0, 2, "from the front"))
 

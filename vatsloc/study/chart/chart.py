@@ -19,7 +19,7 @@ from vatsloc.errors import InputRefused, NotConverged, VatslocError
 from vatsloc.evaluation.inputs import Truth, read_truth
 from vatsloc.evaluation.statistics import summarize
 from vatsloc.evaluation.tre import RunMaps, target_registration_errors
-from vatsloc.study.chart.chart.variants import Scored, Variant
+from vatsloc.study.chart.variants import Scored, Variant
 from vatsloc.study.cohort.scored import run_maps
 from vatsloc.workflow.pneumothorax import pneumothorax
 from vatsloc.workflow.pose import ChangeOfPose, change_of_pose

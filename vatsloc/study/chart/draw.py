@@ -15,7 +15,7 @@ import jinja2
 
 from vatsloc.errors import CaseError
 from vatsloc.study.chart.chart import PHASES, Row
-from vatsloc.study.chart.chart.points import (
+from vatsloc.study.chart.points import (
     CLOCKS,
     MEASURES,
     PHASE_TITLES,
@@ -24,7 +24,7 @@ from vatsloc.study.chart.chart.points import (
     points_of,
     told_of_presets,
 )
-from vatsloc.study.chart.chart.variants import Variant
+from vatsloc.study.chart.variants import Variant
 from vatsloc.workflow.settings import PRESETS
 
 BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#8a929c"

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from statistics import fmean, median
 
 from vatsloc.study.chart.chart import PHASES, Row
-from vatsloc.study.chart.chart.variants import PANELS, Variant
+from vatsloc.study.chart.variants import PANELS, Variant
 from vatsloc.workflow.settings import PRESETS
 
 PHASE_TITLES = {

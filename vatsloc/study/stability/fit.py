@@ -21,7 +21,7 @@ from registration.volume import Array
 from vatsloc.case import Case, read_case
 from vatsloc.errors import VatslocError
 from vatsloc.evaluation.inputs import Truth, read_truth
-from vatsloc.study.chart.chart.draw import require_matplotlib
+from vatsloc.study.chart.draw import require_matplotlib
 from vatsloc.study.cohort.cohort import SILENT_MM
 from vatsloc.study.stability.fit_draw import draw_disturbed
 from vatsloc.study.tables import Row, markdown

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from vatsloc.study.chart.chart.draw import require_matplotlib
+from vatsloc.study.chart.draw import require_matplotlib
 from vatsloc.study.tables import Row
 
 

@@ -22,7 +22,7 @@ from registration.maps.rigid import RigidTransform
 from registration.sliding import register_sliding
 from registration.spine import register_spine
 from registration.volume import Array, Grid, Mask, Volume
-from vatsloc.study.chart.chart import variants as chart_variants
+from vatsloc.study.chart import variants as chart_variants
 from vatsloc.study.tables import markdown
 from vatsloc.workflow.pose import Register
 

@@ -1,4 +1,4 @@
-"""Both cone-beam CTs side by side: the inflated one carried to the deflated one by a model of the collapse."""
+"""Both cone-beam CTs on one grid: the inflated one warped onto the deflated one by a model of the collapse."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ PRIOR_SPACING_MM = 3.0
 
 
 @dataclass(frozen=True)
-class View:
-    """All on one grid, in the deflated CBCT's frame.
+class WarpedPair:
+    """The deflated CBCT and the warped inflated one, on one grid in the deflated CBCT's frame.
 
     deflated: that image; warped: the inflated one as the model moves it; both_see: what lies in the field of view of
     both; lung, modelled: the collapsed lung as it was segmented and as the model has it, where both see; inf_from_def:
@@ -31,8 +31,8 @@ class View:
     inf_from_def: DisplacementField
 
 
-def view_of(prepared: Prepared, lung_def: Mask, def_from_inf: MeshMap, voxel_mm: float) -> View:
-    """What both images show under the model's map, on voxels of `voxel_mm`."""
+def warped_pair(prepared: Prepared, lung_def: Mask, def_from_inf: MeshMap, voxel_mm: float) -> WarpedPair:
+    """Warp the inflated CBCT by the model's map; both images on voxels of `voxel_mm`."""
     deflated, inflated = (coarsen(image.volume, voxel_mm) for image in (prepared.deflated, prepared.inflated))
     grid = deflated.grid
     back = sampled(def_from_inf.inverse(), grid.with_spacing(PRIOR_SPACING_MM))
@@ -43,4 +43,4 @@ def view_of(prepared: Prepared, lung_def: Mask, def_from_inf: MeshMap, voxel_mm:
         Mask(inside & both, grid.ras_from_ijk)
         for inside in (both, resample_mask(lung_def, grid).inside, covered(moved, grid).inside)
     )
-    return View(deflated, resample(inflated, grid, back), seen, lung, modelled, back)
+    return WarpedPair(deflated, resample(inflated, grid, back), seen, lung, modelled, back)
