@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -148,34 +149,45 @@ def test_a_lung_slides_past_a_wall_that_stays() -> None:
 
 
 def test_bare_tissue_follows_the_depth_and_not_a_tapering_wall() -> None:
-    """Vessels deep in a cone move 9 mm along it; its wall and 9 mm of bare tissue below the wall look unmoved."""
-    vessels, slide = make_pattern(8), np.array([0.0, 0.0, 9.0])
+    """Vessels deep in a cone move 9 mm along it; its wall and 9 mm of bare tissue below the wall look unmoved.
+
+    Where bare tissue ends in one pattern alone is decided by rounding: a millionth of the intensities moved its mean
+    error there by up to a quarter. So four are pooled: 1.74 to 1.77 mm off along the cone against 5.3 to 5.6 without
+    keypoints.
+    """
+    slide = np.array([0.0, 0.0, 9.0])
+    settings = replace(COARSE, voxel_mm=2.8)
+    grid, wide = oriented("LPS", (40, 40, 27), 2.8, CENTRE), oriented("RAS", (40, 40, 36), 2.8, CENTRE)
 
     def depth(points: Array) -> Array:
         off = points - CENTRE
         return 38.0 - 0.2 * off[:, 2] - np.hypot(off[:, 0], off[:, 1])
 
-    def scene(points: Array, shift: Array) -> Array:
-        d = depth(points)
-        tissue = -850 + 0.8 * (vessels(points + shift) + 500) * np.clip((d - 9) / 3, 0, 1)
-        return np.where(d > 0, tissue, 40.0)
-
     def cone(g: Grid) -> Mask:
         return Mask(depth(g.points().reshape(-1, 3)).reshape(g.shape) > 0, g.ras_from_ijk)
 
-    grid = oriented("LPS", (44, 44, 30), 2.5, CENTRE)
-    fixed = image_of(lambda p: scene(p, slide), grid)
-    moving = image_of(lambda p: scene(p, np.zeros(3)), WIDE)
-    fit = register_sliding(fixed, moving, cone(WIDE), COARSE, fixed_lung=cone(grid))
-    rng = np.random.default_rng(6)
-    bare = CENTRE + rng.uniform([-40, -40, -25], [40, 40, 10], (4000, 3))
+    def image(g: Grid, vessels: Callable[[Array], Array], shift: Array) -> Volume:
+        def shown(points: Array) -> Array:
+            d = depth(points)
+            tissue = -850 + 0.8 * (vessels(points + shift) + 500) * np.clip((d - 9) / 3, 0, 1)
+            return np.where(d > 0, tissue, 40.0)
+
+        return image_of(shown, g)
+
+    bare = CENTRE + np.random.default_rng(6).uniform([-40, -40, -25], [40, 40, 10], (4000, 3))
     bare = bare[(depth(bare) > 3) & (depth(bare) < 9)]
     around = Mask(dilate(cone(grid).inside, 5.0, grid.spacing), grid.ras_from_ijk)
-    held = register_ffd(masked(fixed, cone(grid)), masked(moving, cone(WIDE)), COARSE, fixed_mask=around)
-    along, before = (float(np.abs(f.moving_from_fixed(bare)[:, 2] - bare[:, 2] - slide[2]).mean()) for f in (fit, held))
-    assert along < 1.6
-    assert along < 0.7 * before
-    assert fit.folded_share == 0
+    along, before = [], []
+    for seed in range(8, 12):
+        vessels = make_pattern(seed)
+        fixed, moving = image(grid, vessels, slide), image(wide, vessels, np.zeros(3))
+        fit = register_sliding(fixed, moving, cone(wide), settings, fixed_lung=cone(grid))
+        held = register_ffd(masked(fixed, cone(grid)), masked(moving, cone(wide)), settings, fixed_mask=around)
+        assert fit.folded_share == 0
+        for f, off in ((fit, along), (held, before)):
+            off.append(np.abs(f.moving_from_fixed(bare)[:, 2] - bare[:, 2] - slide[2]).mean())
+    assert np.mean(along) < 1.95
+    assert np.mean(along) < 0.37 * np.mean(before)
 
 
 def test_masking_and_dilating_by_value() -> None:
