@@ -318,7 +318,6 @@ def _fit(mesh: TetMesh) -> Fit:
         surface_rms_mm=1.7,
         keypoint_rms_mm=2.3,
         history=4 * (FitStep(1.0, 1.0, state.theta.vector(), True),),
-        spread=state.theta.vector()[None],
         costs=np.array([1.0]),
         status=FitStatus.CONVERGED,
         free=np.ones(3, bool),

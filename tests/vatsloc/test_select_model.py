@@ -186,7 +186,7 @@ def test_too_few_or_too_crowded_places_judge_nothing() -> None:
     assert _too_few(pairs_of()) is None
     assert _too_few(pairs_of(39)) == "only 39 keypoints were matched inside the lung"
     many = pairs_of(2000)
-    hidden, shown = np.flatnonzero(held_out(many.second)), np.flatnonzero(~held_out(many.second))
+    hidden, shown = np.flatnonzero(held_out(many.fixed)), np.flatnonzero(~held_out(many.fixed))
     for h, s in ((10, 30), (40, 10)):
         assert _too_few(many.only(np.concatenate([hidden[:h], shown[:s]]))) is None
     for h, s in ((9, 31), (41, 9)):
@@ -232,21 +232,21 @@ def test_a_correction_that_turns_more_elements_inside_out_is_refused(
     field = np.random.default_rng(2).normal(size=start.displacement.shape)
     asked: list[Any] = []
 
-    def pull_of(target: Target, lung: TetMesh, u: Array) -> str:
-        asked.append((target, lung, u))
-        return "pull"
+    def constraints_to(target: Target, lung: TetMesh, u: Array, settings: FitSettings) -> str:
+        asked.append((target, lung, u, settings))
+        return "constraints"
 
-    def correct(lung: TetMesh, u: Array, tissue: Any, pull: Any, strain: float) -> Any:
-        asked.append((lung, u, pull, strain))
+    def elastic_correction(lung: TetMesh, u: Array, tissue: Any, wanted: Any, strain: float) -> Any:
+        asked.append((lung, u, wanted, strain))
         return SimpleNamespace(u=field, det_f=np.where(np.arange(10000) < share * 10000, -1.0, 1.0))
 
-    monkeypatch.setattr(module, "pull_of", pull_of)
-    monkeypatch.setattr(module, "correct", correct)
-    target = a_surface()
-    found = corrected(0.03)(start, target, start.fit)
+    monkeypatch.setattr(module, "constraints_to", constraints_to)
+    monkeypatch.setattr(module, "elastic_correction", elastic_correction)
+    target, settings = a_surface(), FitSettings(keypoint_sigma_mm=1.25)
+    found = corrected(0.03, settings)(start, target, start.fit)
     assert (found is not start) is taken
-    assert asked[0] == (target, start.system.mesh, start.displacement)
-    assert asked[1] == (start.system.mesh, start.displacement, "pull", 0.03)
+    assert asked[0] == (target, start.system.mesh, start.displacement, settings)
+    assert asked[1] == (start.system.mesh, start.displacement, "constraints", 0.03)
     if taken:
         assert_allclose(found.displacement, start.displacement + field)
 
@@ -270,10 +270,10 @@ def test_the_regional_fit_sets_stretches_and_hilum_free_and_starts_where_it_is_t
         asked.append(values)
         return answer
 
-    monkeypatch.setattr(module, "fit", fit)
+    monkeypatch.setattr(module, "fit_collapse", fit)
     target = a_surface()
     begin = replace(start.fit, theta=Theta(1e-9, 0.7, 4.0, (0.1, 0.2)))
-    found = _regional(GRAVITY, settings_of("balanced", {"model": {"hilum": hilum}}))(start, target, begin)
+    found = _regional(settings_of("balanced", {"model": {"hilum": hilum}}))(start, target, begin)
     ((system, seen, settings),) = asked
     assert seen is target
     assert len(system.modes) == count
@@ -307,18 +307,19 @@ class Climb:
         chosen = StrainChoice(self.solid, Strain.FINITE, "because", 0.01, None)
         for name, answer in (
             ("assemble", system),
-            ("fit", self.plain),
+            ("fit_collapse", self.plain),
             ("keep_in_range", chosen),
             ("find_correspondences", pairs),
             ("perturbation_ensemble", self.others),
         ):
             monkeypatch.setattr(module, name, self._asked(name, answer))
         whole = len(pairs)
-        monkeypatch.setattr(
-            module,
-            "corrected",
-            lambda _strain: lambda m, t, s: knows(1.0 if len(t.inflated) == whole else 0.7)(m, t, s),
-        )
+
+        def corrected(_strain: float, data: FitSettings) -> Any:
+            assert data == fit_settings(self.settings)
+            return lambda m, t, s: knows(1.0 if len(t.inflated) == whole else 0.7)(m, t, s)
+
+        monkeypatch.setattr(module, "corrected", corrected)
 
     def _asked(self, name: str, answer: Any) -> Any:
         def ask(*values: Any, **named: Any) -> Any:
@@ -342,8 +343,8 @@ def test_the_plain_fit_is_made_of_what_was_observed(monkeypatch: pytest.MonkeyPa
     assert_array_equal(gravity, GRAVITY)
     assert_array_equal(hilum, HILUM)
     assert_array_equal(hilum_mm, HILUM_MM)
-    assert_array_equal(known.asked["fit"][1].points, known.observed.surface.points)
-    assert known.asked["fit"][2] == fit_settings(known.settings)
+    assert_array_equal(known.asked["fit_collapse"][1].points, known.observed.surface.points)
+    assert known.asked["fit_collapse"][2] == fit_settings(known.settings)
     assert known.asked["keep_in_range"][1] is known.plain.state
     (choice,) = known.stages.choices
     assert (choice.part, choice.kept, choice.value, choice.limit) == ("finite strain", True, 0.01, 0.001)
