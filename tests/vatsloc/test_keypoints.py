@@ -56,54 +56,57 @@ def test_places_lie_before_the_collapse_where_the_spine_puts_them_and_after_it_w
     assert pairs.fixed[:, 2].max() < PLANE_DEF + 2.5
 
 
-def test_spreading_gets_both_images_in_one_frame_and_the_lung_of_each(
+def test_propagation_gets_both_images_in_one_frame_and_the_lung_of_each(
     observed: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     warped = scene.CENTRE_DEF + np.random.default_rng(1).uniform(-18, 18, (30, 3))
-    second = warped + np.array([1.0, 2.0, 3.0])
+    deflated = warped + np.array([1.0, 2.0, 3.0])
     model = 0.6 * (scene.collapsed(observed.model_mesh.points) - observed.model_mesh.points)
     matched: dict[str, Any] = {}
-    grown: dict[str, Any] = {}
+    propagated: dict[str, Any] = {}
 
-    def match(first: Any, other: Any, region: Any, settings: Any, first_region: Any) -> Correspondences:
-        matched.update(first=first, second=other, region=region, settings=settings, first_region=first_region)
-        return Correspondences.of(second, warped, ncc=np.linspace(0.7, 0.9, 30))
+    def match(fixed: Any, moving: Any, fixed_region: Any, settings: Any, moving_region: Any) -> Correspondences:
+        matched.update(fixed=fixed, moving=moving, settings=settings)
+        matched.update(fixed_region=fixed_region, moving_region=moving_region)
+        return Correspondences.of(deflated, warped, ncc=np.linspace(0.7, 0.9, 30))
 
-    def spread(
-        first: Any, other: Any, before: Any, after: Any, pairs: Correspondences, settings: Any
+    def propagate(
+        fixed: Any, moving: Any, fixed_region: Any, moving_region: Any, seeds: Correspondences, settings: Any
     ) -> Correspondences:
-        grown.update(first=first, second=other, before=before, after=after, settings=settings)
-        return pairs
+        propagated.update(fixed=fixed, moving=moving, after=fixed_region, before=moving_region, settings=settings)
+        return seeds
 
     monkeypatch.setattr(places, "match_keypoints", match)
-    monkeypatch.setattr(places, "grow", spread)
+    monkeypatch.setattr(places, "propagate_matches", propagate)
     pairs = find_correspondences(half_seen(), observed, model, KeypointSettings(voxel_mm=2.0, reach_mm=9.0))
     # The model takes 60 % of an affine collapse: its inverse is affine too.
     gradient = np.eye(3) + 0.6 * (scene.SQUEEZE - np.eye(3))
     before = scene.CENTRE_DEF + (warped - scene.CENTRE_DEF - 0.6 * scene.SHIFT_MM) @ np.linalg.inv(gradient).T
     assert_allclose(pairs.moving, before, atol=1e-6)
-    assert_allclose(pairs.fixed, second)
+    assert_allclose(pairs.fixed, deflated)
     assert_allclose(pairs.ncc, np.linspace(0.7, 0.9, 30))
     assert matched["settings"].voxel_mm == 2.0
     assert matched["settings"].reach_mm == 9.0
-    assert grown["settings"].match == matched["settings"]
+    assert propagated["settings"].match == matched["settings"]
     # Tissue in the region of the modelled and of the observed lung.
     for region, expanded in (
         (
-            matched["first_region"],
+            matched["moving_region"],
             lambda x: scene.CENTRE_DEF + (x - scene.CENTRE_DEF - 0.6 * scene.SHIFT_MM) @ np.linalg.inv(gradient).T,
         ),
-        (matched["region"], scene.expanded),
+        (matched["fixed_region"], scene.expanded),
     ):
         points = region.grid.points()[region.inside]
         assert -2.0 < depth_before(expanded(points)).min() < 1.0
-    corner = grown["first"].grid.to_ras(np.zeros((1, 3)))
+    corner = propagated["moving"].grid.to_ras(np.zeros((1, 3)))
     size = (np.array(scene.inflated().hu.shape) - 1.0) * scene.SPACING_MM / 2
     assert_allclose(scene.DEF_FROM_INF.inverse()(corner)[0], scene.CENTRE_INF - size, atol=3.0)
-    points = grown["before"].grid.points()[grown["before"].inside]
+    assert_array_equal(propagated["fixed"].hu, scene.deflated().hu)
+    assert_array_equal(propagated["moving"].hu, scene.inflated().hu)
+    points = propagated["before"].grid.points()[propagated["before"].inside]
     assert 1.0 < depth_before(points).min() < 4.0
     assert PLANE_INF - 4.0 < scene.DEF_FROM_INF.inverse()(points)[:, 0].max() < PLANE_INF + 2.0
-    points = grown["after"].grid.points()[grown["after"].inside]
+    points = propagated["after"].grid.points()[propagated["after"].inside]
     assert 1.0 < depth_before(scene.expanded(points)).min() < 4.0
     assert PLANE_DEF - 4.0 < points[:, 2].max() < PLANE_DEF + 2.0
     assert points[:, 2].min() < PLANE_DEF - 30.0
