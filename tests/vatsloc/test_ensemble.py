@@ -22,7 +22,7 @@ BEST_U = np.array([[0.5, -0.5, 0.25]])
 
 @dataclass
 class Tries:
-    """Stands in for `fit`: notes what it is asked, and answers try n with the displacement n + 1 along x."""
+    """Stands in for `fit_collapse`: notes what it is asked, and answers try n with the displacement n + 1 along x."""
 
     costs: dict[int, float]
     status: dict[int, PoroStatus]
@@ -47,7 +47,7 @@ def surface() -> Target:
 
 def answers(monkeypatch: pytest.MonkeyPatch, costs: Any = (), status: Any = ()) -> tuple[Array, Tries]:
     tries = Tries(dict(costs), dict(status), [])
-    monkeypatch.setattr(spread, "fit", tries)
+    monkeypatch.setattr(spread, "fit_collapse", tries)
     best: Any = SimpleNamespace(
         theta=Theta(3e-8, 0.75, 9.0),
         costs=np.array([11.0, 10.0]),

@@ -137,17 +137,17 @@ def test_a_node_that_the_way_back_does_not_reach_is_not_believed(monkeypatch: py
     assert found.seen[found.compared & (Scene.nodes[:, 1] < limit - 0.1)].all()
 
 
-def test_each_registration_gets_its_own_images_region_and_keypoints(monkeypatch: pytest.MonkeyPatch) -> None:
-    first = scene.CENTRE_INF + np.random.default_rng(3).uniform(-20, 20, (12, 3))
-    second = scene.CENTRE_DEF + np.random.default_rng(4).uniform(-20, 20, (12, 3))
+def test_each_registration_gets_its_own_images_region_and_matches(monkeypatch: pytest.MonkeyPatch) -> None:
+    moving = scene.CENTRE_INF + np.random.default_rng(3).uniform(-20, 20, (12, 3))
+    fixed = scene.CENTRE_DEF + np.random.default_rng(4).uniform(-20, 20, (12, 3))
     known = Registration(shifted(-OFF), two_valued(0.0, 0.0))
-    assert run(monkeypatch, known, pairs=Correspondences.of(second, first), settings=FINE) is not None
+    assert run(monkeypatch, known, pairs=Correspondences.of(fixed, moving), settings=FINE) is not None
     there, back = known.calls
-    expected = Scene.model(first)
-    assert_allclose(there["keypoints"].fixed, second)
-    assert_allclose(there["keypoints"].moving, expected)
-    assert_allclose(back["keypoints"].fixed, expected)
-    assert_allclose(back["keypoints"].moving, second)
+    expected = Scene.model(moving)
+    assert_allclose(there["matches"].fixed, fixed)
+    assert_allclose(there["matches"].moving, expected)
+    assert_allclose(back["matches"].fixed, expected)
+    assert_allclose(back["matches"].moving, fixed)
     assert there["fixed"] is back["moving"]
     assert there["moving"] is back["fixed"]
     middle = np.linalg.norm(there["fixed"].grid.points() - scene.CENTRE_DEF, axis=-1) > 36.0

@@ -223,7 +223,7 @@ def test_record_holds_each_number_under_its_name(result: ResultData) -> None:
     assert run["settings"] == Settings().model_dump()
     (choice,) = run["choices"]
     assert (choice["part"], choice["kept"], choice["limit"]) == ("extrapolation", False, 0.1)
-    assert run["solid"] == {"model": "linear strain", "why": "strains little", "share_out_of_range": 0.0004}
+    assert run["solid"] == {"strain": "linear strain", "why": "strains little", "share_out_of_range": 0.0004}
     removed = run["cbct_preparation"]
     assert (removed["inflated"]["cupping_hu"], removed["deflated"]["cupping_hu"]) == ([11.0, 0.0], [22.0, 0.0])
 

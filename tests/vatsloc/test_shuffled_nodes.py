@@ -106,9 +106,10 @@ def target_of(u: Array) -> Target:
 
 def test_a_correction_is_the_same_field() -> None:
     u = wavy(BALL.points)
-    start = 0.4 * u
-    found = elastic_correction(BALL, start, Tissue(), constraints_to(target_of(u), BALL, start)).u
-    again = elastic_correction(SHUFFLED, start[ORDER], Tissue(), constraints_to(target_of(u), SHUFFLED, start[ORDER])).u
+    start, target, settings = 0.4 * u, target_of(u), FitSettings()
+    found = elastic_correction(BALL, start, Tissue(), constraints_to(target, BALL, start, settings)).u
+    wanted = constraints_to(target, SHUFFLED, start[ORDER], settings)
+    again = elastic_correction(SHUFFLED, start[ORDER], Tissue(), wanted).u
     assert_allclose(again, found[ORDER], atol=1e-6)
     assert np.linalg.norm(found + start - u, axis=1).mean() < 0.5 * np.linalg.norm(start - u, axis=1).mean()
 
