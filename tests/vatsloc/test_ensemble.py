@@ -1,4 +1,4 @@
-"""Other answers: which tries are made, which of them count, and how far they lie from the best one."""
+"""The perturbation ensemble: which fits are made, which of them count, and how far they lie from the best one."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose
 from poro.collapse import PoroStatus, PoroSystem, Theta
 from poro.fit import FitSettings, Target
 from registration.volume import Array
-from vatsloc.workflow import ensemble as spread
+from vatsloc.workflow import ensemble
 
 GRAVITY = np.array([0.6, 0.0, -0.8])
 HILUM = np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
@@ -47,13 +47,13 @@ def surface() -> Target:
 
 def answers(monkeypatch: pytest.MonkeyPatch, costs: Any = (), status: Any = ()) -> tuple[Array, Tries]:
     tries = Tries(dict(costs), dict(status), [])
-    monkeypatch.setattr(spread, "fit_collapse", tries)
+    monkeypatch.setattr(ensemble, "fit_collapse", tries)
     best: Any = SimpleNamespace(
         theta=Theta(3e-8, 0.75, 9.0),
         costs=np.array([11.0, 10.0]),
         state=SimpleNamespace(u=BEST_U),
     )
-    return spread.perturbation_ensemble(system(), surface(), best, FitSettings(max_steps=17)), tries
+    return ensemble.perturbation_ensemble(system(), surface(), best, FitSettings(max_steps=17)), tries
 
 
 def test_starts_count_where_they_end_as_well_as_the_best(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -151,7 +151,7 @@ def test_parts_that_did_not_run_have_no_gates(scene: known.Scene) -> None:
     assert set(gates_of(scene.with_model(refinements=()))) == every - {"held_out"}
 
 
-def test_held_back_misfit_is_that_of_the_last_step_taken(scene: known.Scene) -> None:
+def test_held_out_misfit_is_that_of_the_last_step_taken(scene: known.Scene) -> None:
     for kept, expected in (((False, False), 4.0), ((True, False), 3.5), ((True, True), 2.75), ((False, True), 2.75)):
         refinements = (Refinement("regional", 4.0, 3.5, kept[0]), Refinement("elastic", 3.5, 2.75, kept[1]))
         assert gates_of(scene.with_model(refinements=refinements))["held_out"].value == expected

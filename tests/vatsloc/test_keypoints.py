@@ -1,4 +1,4 @@
-"""Places inside the lung in the right frames, and both cone-beam CTs side by side."""
+"""Keypoints inside the lung in the right frames, and both cone-beam CTs on one grid."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from registration.correspondences import Correspondences
 from registration.volume import Array
 from tests.vatsloc import ball_scene as scene
 from vatsloc.maps import MeshMap
-from vatsloc.workflow import keypoints as places
+from vatsloc.workflow import keypoints as module
 from vatsloc.workflow.keypoints import find_correspondences
 from vatsloc.workflow.settings import KeypointSettings
 from vatsloc.workflow.warped_pair import warped_pair
@@ -44,16 +44,18 @@ def depth_before(points: Array) -> Array:
     return scene.RADIUS_MM - np.linalg.norm(points - scene.CENTRE_DEF, axis=1)
 
 
-def test_places_lie_before_the_collapse_where_the_spine_puts_them_and_after_it_where_they_went(observed: Any) -> None:
+def test_keypoints_lie_where_the_spine_puts_them_before_the_collapse_and_where_they_went_after_it(
+    observed: Any,
+) -> None:
     model = 0.6 * (scene.collapsed(observed.model_mesh.points) - observed.model_mesh.points)
-    pairs = find_correspondences(half_seen(), observed, model, KeypointSettings(reach_mm=8.0))
-    assert len(pairs) > 70
-    error = np.linalg.norm(scene.collapsed(pairs.moving) - pairs.fixed, axis=1)
+    found = find_correspondences(half_seen(), observed, model, KeypointSettings(reach_mm=8.0))
+    assert len(found) > 70
+    error = np.linalg.norm(scene.collapsed(found.moving) - found.fixed, axis=1)
     assert np.median(error) < 0.8
     assert np.percentile(error, 95) < 2.0
-    assert depth_before(pairs.moving).min() > 0
-    assert scene.DEF_FROM_INF.inverse()(pairs.moving)[:, 0].max() < PLANE_INF + 2.5
-    assert pairs.fixed[:, 2].max() < PLANE_DEF + 2.5
+    assert depth_before(found.moving).min() > 0
+    assert scene.DEF_FROM_INF.inverse()(found.moving)[:, 0].max() < PLANE_INF + 2.5
+    assert found.fixed[:, 2].max() < PLANE_DEF + 2.5
 
 
 def test_propagation_gets_both_images_in_one_frame_and_the_lung_of_each(
@@ -76,15 +78,15 @@ def test_propagation_gets_both_images_in_one_frame_and_the_lung_of_each(
         propagated.update(fixed=fixed, moving=moving, after=fixed_region, before=moving_region, settings=settings)
         return seeds
 
-    monkeypatch.setattr(places, "match_keypoints", match)
-    monkeypatch.setattr(places, "propagate_matches", propagate)
-    pairs = find_correspondences(half_seen(), observed, model, KeypointSettings(voxel_mm=2.0, reach_mm=9.0))
+    monkeypatch.setattr(module, "match_keypoints", match)
+    monkeypatch.setattr(module, "propagate_matches", propagate)
+    found = find_correspondences(half_seen(), observed, model, KeypointSettings(voxel_mm=2.0, reach_mm=9.0))
     # The model takes 60 % of an affine collapse: its inverse is affine too.
     gradient = np.eye(3) + 0.6 * (scene.SQUEEZE - np.eye(3))
     before = scene.CENTRE_DEF + (warped - scene.CENTRE_DEF - 0.6 * scene.SHIFT_MM) @ np.linalg.inv(gradient).T
-    assert_allclose(pairs.moving, before, atol=1e-6)
-    assert_allclose(pairs.fixed, deflated)
-    assert_allclose(pairs.ncc, np.linspace(0.7, 0.9, 30))
+    assert_allclose(found.moving, before, atol=1e-6)
+    assert_allclose(found.fixed, deflated)
+    assert_allclose(found.ncc, np.linspace(0.7, 0.9, 30))
     assert matched["settings"].voxel_mm == 2.0
     assert matched["settings"].reach_mm == 9.0
     assert propagated["settings"].match == matched["settings"]
@@ -113,23 +115,23 @@ def test_propagation_gets_both_images_in_one_frame_and_the_lung_of_each(
 
 
 def test_under_the_right_map_both_images_show_the_same(observed: Any) -> None:
-    view = warped_pair(half_seen(), scene.lung_deflated(), MeshMap(INFLATED, TRUTH, scene.DEF_FROM_INF), 2.0)
-    assert np.corrcoef(view.warped.hu[view.lung.inside], view.deflated.hu[view.lung.inside])[0, 1] > 0.9
-    assert (view.lung.inside == view.modelled.inside).mean() > 0.985
-    points = view.both_see.grid.points()
-    back = scene.DEF_FROM_INF.inverse()(scene.expanded(points[view.lung.inside]))
+    scans = warped_pair(half_seen(), scene.lung_deflated(), MeshMap(INFLATED, TRUTH, scene.DEF_FROM_INF), 2.0)
+    assert np.corrcoef(scans.warped.hu[scans.lung.inside], scans.deflated.hu[scans.lung.inside])[0, 1] > 0.9
+    assert (scans.lung.inside == scans.modelled.inside).mean() > 0.985
+    points = scans.both_see.grid.points()
+    back = scene.DEF_FROM_INF.inverse()(scene.expanded(points[scans.lung.inside]))
     assert back[:, 0].max() < PLANE_INF + 2.5
-    assert points[view.lung.inside][:, 2].max() < PLANE_DEF + 1.1
-    assert_array_equal(view.lung.inside & ~view.both_see.inside, False)
-    assert_array_equal(view.modelled.inside & ~view.both_see.inside, False)
+    assert points[scans.lung.inside][:, 2].max() < PLANE_DEF + 1.1
+    assert_array_equal(scans.lung.inside & ~scans.both_see.inside, False)
+    assert_array_equal(scans.modelled.inside & ~scans.both_see.inside, False)
     inner = np.random.default_rng(5).uniform(-15, 15, (20, 3)) + scene.CENTRE_DEF
-    assert_allclose(view.inf_from_def(inner), scene.DEF_FROM_INF.inverse()(scene.expanded(inner)), atol=0.05)
+    assert_allclose(scans.inf_from_def(inner), scene.DEF_FROM_INF.inverse()(scene.expanded(inner)), atol=0.05)
 
 
 def test_the_modelled_lung_is_the_moved_mesh(observed: Any) -> None:
-    view = warped_pair(
+    scans = warped_pair(
         scene.prepared(), scene.lung_deflated(), MeshMap(INFLATED, BEFORE.points, scene.DEF_FROM_INF), 2.0
     )
-    points = view.modelled.grid.points()[view.modelled.inside]
+    points = scans.modelled.grid.points()[scans.modelled.inside]
     assert_allclose(points.mean(axis=0), scene.CENTRE_DEF, atol=0.3)
-    assert view.modelled.inside.sum() * 8 == pytest.approx(BEFORE.volumes.sum(), rel=0.02)
+    assert scans.modelled.inside.sum() * 8 == pytest.approx(BEFORE.volumes.sum(), rel=0.02)

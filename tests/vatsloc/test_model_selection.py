@@ -1,4 +1,4 @@
-"""The ladder takes a refinement only when places held back from it say so."""
+"""A refinement is kept only when keypoints held out from it say so."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def test_misfit_is_the_median_distance(lung: TetMesh) -> None:
     assert misfit(lung, np.broadcast_to(shift, lung.points.shape), Correspondences.of(y, x)) == pytest.approx(4.0)
 
 
-def test_a_quarter_is_held_back_in_whole_blocks() -> None:
+def test_a_quarter_is_held_out_in_whole_blocks() -> None:
     points = np.random.default_rng(0).uniform(0, 400, (4000, 3))
     hidden = held_out(points)
     assert 0.15 < hidden.mean() < 0.35
@@ -90,7 +90,7 @@ def test_a_quarter_is_held_back_in_whole_blocks() -> None:
     assert set(np.unique(share)) == {0.0, 1.0}
 
 
-def test_a_rung_that_predicts_what_it_has_not_seen_is_taken_and_follows_all_pairs(
+def test_a_refinement_that_predicts_what_it_has_not_seen_is_taken_and_follows_all_pairs(
     still: CollapseModel, surface: Target
 ) -> None:
     model, training_only = select_refinement(_steps(), still, still, surface)
@@ -109,7 +109,7 @@ def test_a_rung_that_predicts_what_it_has_not_seen_is_taken_and_follows_all_pair
 
 
 def test_a_step_that_fails_with_all_pairs_gives_way_to_the_next_best(still: CollapseModel, surface: Target) -> None:
-    everything = len(still.pairs)
+    everything = len(still.correspondences)
 
     def fails(model: CollapseModel, target: Target, start: Fit) -> CollapseModel:
         return model if len(target.inflated) == everything else corrected(0.05, FitSettings())(model, target, start)
@@ -123,26 +123,31 @@ def test_the_standard_deviation_of_keypoints_in_the_settings_reaches_the_correct
     still: CollapseModel, surface: Target
 ) -> None:
     """The surer they are said to be, the closer they are followed."""
-    target = replace(surface, inflated=still.pairs.moving, deflated=still.pairs.fixed, keypoint_weights=np.ones(300))
+    target = replace(
+        surface,
+        inflated=still.correspondences.moving,
+        deflated=still.correspondences.fixed,
+        keypoint_weights=np.ones(300),
+    )
     left = []
     for sigma_mm in (0.5, 50.0):
         settings = fit_settings(settings_of("balanced", {"keypoints": {"sigma_mm": sigma_mm}}))
         found = corrected(0.05, settings)(still, target, still.fit)
-        left.append(misfit(still.system.mesh, found.displacement, still.pairs))
+        left.append(misfit(still.system.mesh, found.displacement, still.correspondences))
     assert left[0] < 0.5 * left[1]
 
 
 def test_noise_alone_is_not_worth_a_rung(still: CollapseModel) -> None:
     boundary = still.system.mesh.boundary
     stays = Target(boundary.points, boundary.node_normals, np.ones(len(boundary.points)))
-    noisy = replace(still, pairs=_pairs(noise_mm=2.0, smooth=False))
+    noisy = replace(still, correspondences=_pairs(noise_mm=2.0, smooth=False))
     model, training_only = select_refinement(_steps(), noisy, noisy, stays)
     assert [refinement.kept for refinement in model.refinements] == [False, False]
     assert_allclose(model.displacement, 0)
     assert_allclose(training_only.displacement, 0)
 
 
-def test_other_answers_follow_the_inputs_and_agree_where_the_surface_tells_all(
+def test_the_ensemble_follow_the_inputs_and_agree_where_the_surface_tells_all(
     lung: TetMesh, still: CollapseModel
 ) -> None:
     system = still.system
@@ -151,12 +156,12 @@ def test_other_answers_follow_the_inputs_and_agree_where_the_surface_tells_all(
     seen = Target(boundary.points, boundary.node_normals, np.ones(len(boundary.points)))
     settings = FitSettings(free=(True, True, False))
     best = fit_collapse(system, seen, settings)
-    others = perturbation_ensemble(system, seen, best, settings)
-    at_hilum = np.linalg.norm(others[:, system.hilum].mean(axis=1), axis=1)
-    moved = others[np.abs(at_hilum - 3) < 1e-6]
+    members = perturbation_ensemble(system, seen, best, settings)
+    at_hilum = np.linalg.norm(members[:, system.hilum].mean(axis=1), axis=1)
+    moved = members[np.abs(at_hilum - 3) < 1e-6]
     assert len(moved) == 3
     assert_allclose(np.abs(moved[:, system.hilum].mean(axis=1)), 3 * np.eye(3), atol=1e-6)
-    held = others[at_hilum < 1e-6]
+    held = members[at_hilum < 1e-6]
     assert len(held) >= 4
     # Starts and halves of a surface that the model explains end where the best fit did; only the two tilts differ.
     assert sorted(np.linalg.norm(held, axis=2).max(axis=1) > 0.5) == [False] * (len(held) - 2) + [True] * 2

@@ -233,7 +233,9 @@ def test_residuals_hold_each_solvers_own_numbers() -> None:
     away = np.full((2, *known.scene().collapse.system.mesh.points.shape), [3.0, 4.0, 0.0])
     away[1] = 0.0
     refinements = (Refinement("first", 4.0, 3.0, True), Refinement("second", 3.0, 2.5, False))
-    scene = known.scene().with_collapse(residual=known.corrected(lung)).with_model(others=away, refinements=refinements)
+    scene = (
+        known.scene().with_collapse(residual=known.corrected(lung)).with_model(ensemble=away, refinements=refinements)
+    )
     run = _residuals(localization(scene))
     for name, ncc, other, overlap in (
         ("spine_ct_inflated", 0.81, 0.6, 0.93),
@@ -269,9 +271,9 @@ def test_residuals_hold_each_solvers_own_numbers() -> None:
     assert run["mesh"] == {"tetrahedra": len(lung.tets), "model_tetrahedra": tets}
 
 
-def test_what_other_answers_are_off_by_is_read_where_the_spine_puts_the_nodule() -> None:
+def test_what_the_ensemble_are_off_by_is_read_where_the_spine_puts_the_nodule() -> None:
     mesh = known.scene().collapse.system.mesh
-    scene = known.scene().with_model(others=(mesh.points - known.CENTRE)[None])
+    scene = known.scene().with_model(ensemble=(mesh.points - known.CENTRE)[None])
     placed = known.DEF_FROM_INF_RIGID(known.NODULE_INF[None])[0]
     rms = _residuals(localization(scene))["perturbation_ensemble"]["rms_mm_at_nodule"]
     assert rms == pytest.approx(np.linalg.norm(placed - known.CENTRE))

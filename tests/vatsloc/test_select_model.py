@@ -1,4 +1,4 @@
-"""The ladder as a whole: what each step is shown, which model it starts from, and what is left out and why."""
+"""Model selection as a whole: what each step is shown, which model it starts from, and what is left out and why."""
 
 from __future__ import annotations
 
@@ -53,9 +53,9 @@ def motion(points: Array) -> Array:
 
 
 def pairs_of(count: int = 400, seed: int = 5) -> Correspondences:
-    """Places that move by the scene's collapse."""
+    """Keypoints that move by the scene's collapse."""
     x = scene.CENTRE_DEF + np.random.default_rng(seed).uniform(-19, 19, (count, 3))
-    # Far enough from each other that some blocks of 40 mm are held back and others are not.
+    # Far enough from each other that some blocks of 40 mm are held out and others are not.
     return Correspondences.of(scene.collapsed(x), x)
 
 
@@ -69,7 +69,7 @@ def a_fit(displacement: Array, settled: bool = True, tets: int = 1, inverted: fl
 
 @dataclass(frozen=True)
 class _Fit:
-    """What the ladder reads of a fit."""
+    """What model selection reads of a fit."""
 
     theta: Theta
     state: Any
@@ -101,7 +101,7 @@ def a_surface() -> Target:
     return Target(found.points, found.normals, found.confidence)
 
 
-def test_held_back_places_are_never_shown_to_the_model_that_is_judged_by_them() -> None:
+def test_held_out_keypoints_are_never_shown_to_the_model_that_is_judged_by_them() -> None:
     shown: list[tuple[CollapseModel, Target, Any]] = []
 
     def watched(model: CollapseModel, target: Target, start: Fit) -> CollapseModel:
@@ -114,15 +114,15 @@ def test_held_back_places_are_never_shown_to_the_model_that_is_judged_by_them() 
     u, surface = start.displacement, a_surface()
     training_only = replace(start, displacement=0.5 * u, fit=a_fit(u))
     model, trained = select_refinement({"step": watched}, start, training_only, surface)
-    hidden = held_out(start.pairs.fixed)
+    hidden = held_out(start.correspondences.fixed)
     assert 10 < hidden.sum() < len(hidden) - 10
     (one, few, from_one), (other, every, from_other) = shown
     assert (one, other) == (training_only, start)
-    assert_array_equal(few.inflated, start.pairs.moving[~hidden])
-    assert_array_equal(few.deflated, start.pairs.fixed[~hidden])
+    assert_array_equal(few.inflated, start.correspondences.moving[~hidden])
+    assert_array_equal(few.deflated, start.correspondences.fixed[~hidden])
     assert_array_equal(few.keypoint_weights, np.ones((~hidden).sum()))
-    assert_array_equal(every.inflated, start.pairs.moving)
-    assert_array_equal(every.deflated, start.pairs.fixed)
+    assert_array_equal(every.inflated, start.correspondences.moving)
+    assert_array_equal(every.deflated, start.correspondences.fixed)
     for target in (few, every):
         assert_array_equal(target.points, surface.points)
         assert_array_equal(target.normals, surface.normals)
@@ -131,7 +131,7 @@ def test_held_back_places_are_never_shown_to_the_model_that_is_judged_by_them() 
     assert_allclose(trained.displacement, 0.8 * motion(start.system.mesh.points))
     assert_allclose(model.displacement, 0.9 * motion(start.system.mesh.points))
     (refinement,) = model.refinements
-    whole = np.linalg.norm(start.pairs.fixed - start.pairs.moving, axis=1)[hidden]
+    whole = np.linalg.norm(start.correspondences.fixed - start.correspondences.moving, axis=1)[hidden]
     assert refinement.before_mm == pytest.approx(
         0.9 * np.median(whole), rel=0.05
     )  # the training_only model knows 0.1 of it
@@ -140,7 +140,7 @@ def test_held_back_places_are_never_shown_to_the_model_that_is_judged_by_them() 
 
 
 @pytest.mark.parametrize(("left", "kept"), [(GAIN + 0.01, False), (GAIN - 0.01, True)])
-def test_a_rung_has_to_gain_five_percent(left: float, kept: bool) -> None:
+def test_a_refinement_has_to_gain_five_percent(left: float, kept: bool) -> None:
     start = a_model(0.0)
     model, training_only = select_refinement({"step": knows(1 - left)}, start, start, a_surface())
     (refinement,) = model.refinements
@@ -164,16 +164,16 @@ def test_the_best_is_taken_and_where_it_does_not_settle_the_next_best() -> None:
     ]
     assert_allclose(model.displacement, 0.8 * motion(start.system.mesh.points))
 
-    def only_blind(model: CollapseModel, target: Target, begin: Fit) -> CollapseModel:
-        whole = len(target.inflated) == len(start.pairs)
+    def only_training(model: CollapseModel, target: Target, begin: Fit) -> CollapseModel:
+        whole = len(target.inflated) == len(start.correspondences)
         return replace(knows(0.9)(model, target, begin), fit=a_fit(start.displacement, settled=not whole))
 
-    model, training_only = select_refinement({"f": only_blind, **steps}, start, start, a_surface())
+    model, training_only = select_refinement({"f": only_training, **steps}, start, start, a_surface())
     assert [refinement.name for refinement in model.refinements if refinement.kept] == ["b"]
     assert_allclose(training_only.displacement, 0.8 * motion(start.system.mesh.points))
 
 
-def test_rungs_add_up_and_the_last_one_kept_says_what_remains() -> None:
+def test_refinements_add_up_and_the_last_one_kept_says_what_remains() -> None:
     model = a_model(refinements=(Refinement("a", 5.0, 4.0, True), Refinement("b", 4.0, 4.5, False)))
     assert model.held_out_mm == 4.0
     assert a_model(refinements=(Refinement("a", 5.0, 4.9, False),)).held_out_mm == 5.0
@@ -182,7 +182,7 @@ def test_rungs_add_up_and_the_last_one_kept_says_what_remains() -> None:
     assert [refinement.name for refinement in again.refinements] == ["a", "b", "c"]
 
 
-def test_too_few_or_too_crowded_places_judge_nothing() -> None:
+def test_too_few_or_too_crowded_keypoints_judge_nothing() -> None:
     assert _too_few(pairs_of()) is None
     assert _too_few(pairs_of(39)) == "only 39 keypoints were matched inside the lung"
     many = pairs_of(2000)
@@ -285,7 +285,7 @@ def test_the_regional_fit_sets_stretches_and_hilum_free_and_starts_where_it_is_t
     assert_array_equal(found.displacement, answer.state.u)
 
 
-class Climb:
+class Selection:
     """`select_model` with a plain fit that knows 20 % of the collapse, and corrections that know all of it when shown
     all.
     """
@@ -336,7 +336,7 @@ class Climb:
 
 
 def test_the_plain_fit_is_made_of_what_was_observed(monkeypatch: pytest.MonkeyPatch) -> None:
-    known = Climb(monkeypatch, pairs_of())
+    known = Selection(monkeypatch, pairs_of())
     known.run()
     lung, _, gravity, hilum, hilum_mm = known.asked["assemble"]
     assert lung is known.observed.model_mesh
@@ -350,8 +350,8 @@ def test_the_plain_fit_is_made_of_what_was_observed(monkeypatch: pytest.MonkeyPa
     assert (choice.part, choice.kept, choice.value, choice.limit) == ("finite strain", True, 0.01, 0.001)
 
 
-def test_places_are_looked_for_where_the_strain_measure_that_holds_puts_them(monkeypatch: pytest.MonkeyPatch) -> None:
-    known = Climb(monkeypatch, pairs_of())
+def test_keypoints_are_matched_where_the_strain_measure_that_holds_puts_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    known = Selection(monkeypatch, pairs_of())
     model = known.run()
     prepared, observed, displacement, settings = known.asked["find_correspondences"]
     assert prepared is known.prepared
@@ -376,10 +376,10 @@ def test_places_are_looked_for_where_the_strain_measure_that_holds_puts_them(mon
         (pairs_of(), {"model": {"regional": False, "correct": False}}, {}),
     ],
 )
-def test_without_a_rung_the_plain_answer_stands_and_other_answers_say_how_sure_it_is(
+def test_without_a_refinement_the_plain_fit_stands_and_the_ensemble_says_how_sure_it_is(
     monkeypatch: pytest.MonkeyPatch, pairs: Correspondences, tables: dict[str, Any], skipped: dict[str, str]
 ) -> None:
-    known = Climb(monkeypatch, pairs)
+    known = Selection(monkeypatch, pairs)
     model = known.run(**tables)
     assert_array_equal(model.displacement, known.solid.u)
     assert model.fit.state is known.solid

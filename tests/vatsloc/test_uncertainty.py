@@ -1,5 +1,5 @@
-"""Certainty of a point: images where they placed it, the model's doubts where they did not, never better than a place
-found again nearby allows."""
+"""Uncertainty of a point: the images' where they placed it, the model's where they did not, never less than a keypoint
+nearby allows."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ class Scene:
     mesh: TetMesh
     seen: Any = None
     disagreement_mm: Any = None
-    places: Any = None
+    keypoints: Any = None
     missed: Any = 0.0
-    others: Any = field(default_factory=lambda: np.zeros((0, 0, 3)))
+    ensemble: Any = field(default_factory=lambda: np.zeros((0, 0, 3)))
 
     @property
     def pose(self) -> Any:
@@ -40,8 +40,10 @@ class Scene:
         along_x = np.zeros((n, 3, 1))
         along_x[:, 0] = 1.0
         fit = SimpleNamespace(sensitivity=along_x, covariance=np.array([[4.0]]), surface_rms_mm=9, keypoint_rms_mm=9)
-        pairs = () if self.places is None else Correspondences.of(self.places, self.places + self.missed)
-        model = SimpleNamespace(others=self.others, pairs=pairs, refinements=() if self.places is None else ("tried",))
+        found = () if self.keypoints is None else Correspondences.of(self.keypoints, self.keypoints + self.missed)
+        model = SimpleNamespace(
+            ensemble=self.ensemble, correspondences=found, refinements=() if self.keypoints is None else ("tried",)
+        )
         corrected = SimpleNamespace(seen=self.seen, disagreement_mm=self.disagreement_mm)
         return SimpleNamespace(
             def_from_inf_rigid=RigidTransform.about(np.zeros(3), np.zeros(3), np.zeros(3)),
@@ -80,14 +82,16 @@ def test_where_registrations_placed_the_tissue_their_disagreement_counts(ball: T
     assert_allclose(guessed, np.diag([20.0, 16, 16]), atol=1e-9)
 
 
-def test_nothing_is_surer_than_the_places_about_it_allow(ball: TetMesh) -> None:
+def test_nothing_is_surer_than_the_keypoints_about_it_allow(ball: TetMesh) -> None:
     n = len(ball.points)
-    places = np.array([[-20.0, 0, 0], [-20.0, 4, 0]])
-    scene = Scene(ball, np.ones(n, bool), np.zeros(n), places=places)
+    keypoints = np.array([[-20.0, 0, 0], [-20.0, 4, 0]])
+    scene = Scene(ball, np.ones(n, bool), np.zeros(n), keypoints=keypoints)
     near, far = scene.covariance([-20, 0, 0], [20, 0, 0])
     assert_allclose(near, 0.5 * np.eye(3), atol=1e-9)
     assert_allclose(far, (0.15 * 32) ** 2 * np.eye(3), atol=1e-9)
-    missed = Scene(ball, np.ones(n, bool), np.zeros(n), places=places, missed=np.array([[2.0, 0, 0], [0, 0, 4.0]]))
+    missed = Scene(
+        ball, np.ones(n, bool), np.zeros(n), keypoints=keypoints, missed=np.array([[2.0, 0, 0], [0, 0, 4.0]])
+    )
     near, far = missed.covariance([-20, 0, 0], [20, 0, 0])
     assert_allclose(near, (1.5 * 3) ** 2 * np.eye(3), atol=1e-9)
     assert_allclose(far, (1.5 * 3 + 0.15 * 32) ** 2 * np.eye(3), atol=1e-9)
@@ -99,9 +103,9 @@ def test_sigma_grows_with_misfit_and_beyond_reach_with_distance() -> None:
 
 
 def test_scatter_is_the_second_moment_of_the_other_answers(ball: TetMesh) -> None:
-    others = np.zeros((2, len(ball.points), 3))
-    others[0, :, 0], others[1, :, 1] = 2.0, 4.0
-    scene = Scene(ball, others=others)
+    members = np.zeros((2, len(ball.points), 3))
+    members[0, :, 0], members[1, :, 1] = 2.0, 4.0
+    scene = Scene(ball, ensemble=members)
     assert_allclose(scatter(scene.collapse, np.zeros((1, 3))), [np.diag([2.0, 8.0, 0.0])], atol=1e-9)
     assert_allclose(scatter(Scene(ball).collapse, np.zeros((1, 3))), np.zeros((1, 3, 3)))
     assert_allclose(scene.covariance([0, 0, 0]), [np.diag([22.0, 24.0, 16.0])], atol=1e-9)

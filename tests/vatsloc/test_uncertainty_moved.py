@@ -28,23 +28,23 @@ def sure(scene: known.Scene, ct: Array) -> Array:
     return covariance(scene.pose, scene.collapse, known.INF_FROM_CT(ct), known.DEF_FROM_CT(ct))
 
 
-def with_places() -> known.Scene:
-    """Eight places found again along a line; the answer misses place n by MISSED[n]."""
+def with_keypoints() -> known.Scene:
+    """Eight keypoints along a line; the result misses keypoint n by MISSED[n]."""
     first = known.DEF_FROM_INF_RIGID(known.INF_FROM_CT(known.CENTRE + np.outer(np.arange(8.0) - 4.0, [5.0, 0, 0])))
     towards = np.tile([[0.6, 0.0, 0.8], [0.0, -1.0, 0.0]], (4, 1))
     second = known.AFTER_FROM_BEFORE(first) + 0.01 * MISSED[:, None] * towards
-    return known.scene().with_model(pairs=Correspondences.of(second, first), refinements=TRIED)
+    return known.scene().with_model(correspondences=Correspondences.of(second, first), refinements=TRIED)
 
 
 def test_without_images_the_model_counts_where_the_spine_puts_a_point() -> None:
     assert_allclose(sure(known.scene(), CT), known.modelled(BEFORE, 4.0))
 
 
-def test_other_answers_add_to_the_model() -> None:
+def test_the_ensemble_add_to_the_model() -> None:
     mesh = known.scene().collapse.system.mesh
     off = (mesh.points - known.CENTRE) / 5.0
-    others = np.stack([off, np.broadcast_to([3.0, -1.0, 2.0], off.shape), off[:, [1, 2, 0]]])
-    scene = known.scene().with_model(others=others)
+    members = np.stack([off, np.broadcast_to([3.0, -1.0, 2.0], off.shape), off[:, [1, 2, 0]]])
+    scene = known.scene().with_model(ensemble=members)
     d = (BEFORE - known.CENTRE) / 5.0
     each = [d, np.broadcast_to([3.0, -1.0, 2.0], d.shape), d[:, [1, 2, 0]]]
     mean = sum(np.array([np.outer(v, v) for v in one]) for one in each) / 3
@@ -68,16 +68,16 @@ def test_where_registrations_placed_tissue_they_count_node_by_node() -> None:
     assert_allclose(got[3], half, atol=1e-9)
 
 
-def test_nearest_places_are_those_of_the_deflated_image() -> None:
-    collapse = with_places().collapse
-    places = collapse.model.correspondences.fixed
-    distance, missed = nearest_correspondences(collapse, places[[0, 7]] + [0, 0, 1e-3])
+def test_nearest_keypoints_are_those_of_the_deflated_image() -> None:
+    collapse = with_keypoints().collapse
+    keypoints = collapse.model.correspondences.fixed
+    distance, missed = nearest_correspondences(collapse, keypoints[[0, 7]] + [0, 0, 1e-3])
     assert_allclose(distance, 1e-3, atol=1e-9)
     assert_allclose(missed, [0.01 * MISSED[:6].mean(), 0.01 * MISSED[2:].mean()], rtol=1e-6)
 
 
-def test_places_are_measured_from_where_the_answer_puts_a_point() -> None:
-    scene = with_places()
+def test_keypoints_are_measured_from_where_the_answer_puts_a_point() -> None:
+    scene = with_keypoints()
     got = sure(scene, CT)
     second, after = scene.collapse.model.correspondences.fixed, known.DEF_FROM_CT(CT)
     for point, before, one in zip(after, BEFORE, got, strict=True):
@@ -90,7 +90,7 @@ def test_places_are_measured_from_where_the_answer_puts_a_point() -> None:
 def test_registrations_are_no_surer_than_the_places_about_them() -> None:
     lung = known.scene().pose.mesh_ct
     sharp = replace(known.corrected(lung), seen=np.ones(len(lung.points), bool), disagreement_mm=np.full(199, 0.6))
-    scene = with_places().with_collapse(residual=sharp)
+    scene = with_keypoints().with_collapse(residual=sharp)
     distance, missed = nearest_correspondences(scene.collapse, known.DEF_FROM_CT(CT))
     sigma = 1.5 * missed + 0.15 * np.maximum(distance - 8.0, 0.0)
     least = 0.5 + 0.3**2
@@ -101,7 +101,7 @@ def test_registrations_are_no_surer_than_the_places_about_them() -> None:
 
 
 def test_radius_is_the_longest_semi_axis_at_each_node_of_the_moved_lung() -> None:
-    scene = with_places()
+    scene = with_keypoints()
     nodes = scene.pose.mesh_ct.points
     longest = QUANTILE * np.sqrt(np.linalg.eigvalsh(sure(scene, nodes)).max(axis=1))
     assert np.ptp(longest) > 1
