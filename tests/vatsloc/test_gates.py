@@ -13,8 +13,8 @@ from registration.volume import Mask
 from tests.vatsloc import run_scene as known
 from vatsloc.imaging.surface import Border
 from vatsloc.workflow.gates import Gate
-from vatsloc.workflow.localize import in_view, quality_gates, surface_distances
 from vatsloc.workflow.model_selection import Refinement
+from vatsloc.workflow.quality import in_view, quality_gates, surface_distances
 from vatsloc.workflow.settings import GateSettings
 from vatsloc.workflow.stages import Stages
 

@@ -16,7 +16,7 @@ from vatsloc.report.data import LUNG, SURFACE
 from vatsloc.results import ResultData
 from vatsloc.workflow.choices import Choice
 from vatsloc.workflow.gates import Gate
-from vatsloc.workflow.localize import Localization
+from vatsloc.workflow.localization import Localization
 from vatsloc.workflow.model_selection import Refinement
 from vatsloc.workflow.run import _fields, _nodule_mask, _pictures, _record, _residuals, _result
 from vatsloc.workflow.settings import Settings
@@ -28,7 +28,7 @@ GATES = {"overlap": Gate(0.63, 0.4, True, "a"), "ellipsoid": Gate(6.0, 5.5, Fals
 
 
 def localization(scene: known.Scene) -> Localization:
-    """What `conclude` would make of a scene, with round numbers."""
+    """What `locate_nodule` would make of a scene, with round numbers."""
     return Localization(
         scene.prepared, scene.pose, scene.collapse, known.NODULE_INF, known.NODULE_DEF, ELLIPSOID_MM, AXES, GATES
     )

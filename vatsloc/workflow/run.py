@@ -24,9 +24,11 @@ from vatsloc.report.data import LUNG, SURFACE, Outline, Picture
 from vatsloc.report.render import write_report
 from vatsloc.results import OUTPUT_FILES, RADIUS95, REPORT, SCENE, ResultData, RunRecord, write_results
 from vatsloc.slicer_scene import write_result_scene
-from vatsloc.workflow.localize import Localization, localize, surface_distances
+from vatsloc.workflow.localization import Localization
+from vatsloc.workflow.localize import localize
 from vatsloc.workflow.pneumothorax import contact_surface
 from vatsloc.workflow.pose import ChangeOfPose
+from vatsloc.workflow.quality import surface_distances
 from vatsloc.workflow.residual import Residual
 from vatsloc.workflow.settings import Settings
 from vatsloc.workflow.stages import Say, Stages, quiet

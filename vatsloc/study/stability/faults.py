@@ -16,7 +16,8 @@ from vatsloc.errors import VatslocError
 from vatsloc.evaluation.inputs import Truth
 from vatsloc.study.stability.fit import Scene, direction, errors_mm, read_scene, slipped_spine
 from vatsloc.study.tables import Row, markdown
-from vatsloc.workflow.localize import Localization, checked, conclude, localize
+from vatsloc.workflow.localization import Localization, checked, locate_nodule
+from vatsloc.workflow.localize import localize
 from vatsloc.workflow.pneumothorax import Collapse, collapse
 from vatsloc.workflow.settings import Settings
 from vatsloc.workflow.stages import Say, Stages, quiet
@@ -152,8 +153,9 @@ def _finished(scene: Scene) -> Localization:
 
 
 def _answered(scene: Scene, found: Collapse) -> Localization:
-    answer = conclude(scene.case, scene.prepared, scene.pose, found, scene.settings, Stages())
-    return checked(scene.case, answer, scene.settings)
+    stages = Stages()
+    answer = locate_nodule(scene.case, scene.prepared, scene.pose, found, scene.settings, stages)
+    return checked(scene.case, answer, scene.settings, stages)
 
 
 def _shifted(mm: float) -> Fault:

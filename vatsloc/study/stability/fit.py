@@ -25,7 +25,7 @@ from vatsloc.study.chart.draw import require_matplotlib
 from vatsloc.study.cohort.cohort import SILENT_MM
 from vatsloc.study.stability.fit_draw import draw_disturbed
 from vatsloc.study.tables import Row, markdown
-from vatsloc.workflow.localize import Localization, checked, conclude
+from vatsloc.workflow.localization import Localization, checked, locate_nodule
 from vatsloc.workflow.model_selection import fit_settings, surface_target
 from vatsloc.workflow.observe import Observed, observe
 from vatsloc.workflow.pneumothorax import collapse
@@ -84,8 +84,8 @@ def disturbed(scene: Scene, disturb: Disturb) -> Row:
         wrong = disturb(scene, np.random.default_rng(0))
         stages = Stages()
         found = collapse(wrong.case, wrong.prepared, wrong.pose, wrong.observed, scene.settings, stages)
-        answer = conclude(wrong.case, wrong.prepared, wrong.pose, found, scene.settings, stages)
-        answer = checked(wrong.case, answer, scene.settings)
+        answer = locate_nodule(wrong.case, wrong.prepared, wrong.pose, found, scene.settings, stages)
+        answer = checked(wrong.case, answer, scene.settings, stages)
     except VatslocError as error:
         return {"landmarks_mm": "", "nodule_mm": "", "flagged": type(error).__name__, "silent": False}
     mean, off = errors_mm(answer, scene.truth)
