@@ -10,12 +10,12 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from vatsloc.errors import CaseError
+from vatsloc.frames import Side
 
 FILE_NAME = "case.toml"
 GRAVITY_LENGTH_TOLERANCE = 0.05
 """How far from 1 the length of gravity may be; components rounded to one digit stay within it."""
 
-Side = Literal["right", "left"]
 PleuralGas = Literal["air", "co2"]
 Coordinate = Annotated[float, Field(allow_inf_nan=False)]
 Triple = tuple[Coordinate, Coordinate, Coordinate]
