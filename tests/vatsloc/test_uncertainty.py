@@ -102,6 +102,10 @@ def test_sigma_grows_with_misfit_and_beyond_reach_with_distance() -> None:
     assert_allclose(correspondence_sigma_mm(distances, misfits), [0.75, 0.75, 0.75 + 0.15 * 20, 3.0])
 
 
+def test_tissue_is_no_surer_than_the_registration_that_matched_the_keypoints_about_it() -> None:
+    assert_allclose(correspondence_sigma_mm(np.zeros(3), np.array([0.0, 0.3, 0.4])), [0.5, 0.5, 0.6])
+
+
 def test_scatter_is_the_second_moment_of_the_other_answers(ball: TetMesh) -> None:
     members = np.zeros((2, len(ball.points), 3))
     members[0, :, 0], members[1, :, 1] = 2.0, 4.0

@@ -20,7 +20,7 @@ QUANTILE = np.sqrt(7.814728)  # of chi-squared with three degrees of freedom, 95
 TRIED = (Refinement("regional", 4.0, 3.0, True),)
 CT = known.CENTRE + np.array([[5.0, 2, 1], [-12.0, 8, 6], [3.0, -14, -9], [0.0, 4.0, 17]])
 BEFORE = known.DEF_FROM_INF_RIGID(known.INF_FROM_CT(CT))
-MISSED = np.array([1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0])  # mm, so that every sum is of one choice alone
+MISSED = 0.04 * 2.0 ** np.arange(8)  # mm, so that every sum is of one choice alone
 
 
 def sure(scene: known.Scene, ct: Array) -> Array:
@@ -32,7 +32,7 @@ def with_keypoints() -> known.Scene:
     """Eight keypoints along a line; the result misses keypoint n by MISSED[n]."""
     first = known.DEF_FROM_INF_RIGID(known.INF_FROM_CT(known.CENTRE + np.outer(np.arange(8.0) - 4.0, [5.0, 0, 0])))
     towards = np.tile([[0.6, 0.0, 0.8], [0.0, -1.0, 0.0]], (4, 1))
-    second = known.AFTER_FROM_BEFORE(first) + 0.01 * MISSED[:, None] * towards
+    second = known.AFTER_FROM_BEFORE(first) + MISSED[:, None] * towards
     return known.scene().with_model(correspondences=Correspondences.of(second, first), refinements=TRIED)
 
 
@@ -73,7 +73,7 @@ def test_nearest_keypoints_are_those_of_the_deflated_image() -> None:
     keypoints = collapse.model.correspondences.fixed
     distance, missed = nearest_correspondences(collapse, keypoints[[0, 7]] + [0, 0, 1e-3])
     assert_allclose(distance, 1e-3, atol=1e-9)
-    assert_allclose(missed, [0.01 * MISSED[:6].mean(), 0.01 * MISSED[2:].mean()], rtol=1e-6)
+    assert_allclose(missed, [MISSED[:6].mean(), MISSED[2:].mean()], rtol=1e-6)
 
 
 def test_keypoints_are_measured_from_where_the_answer_puts_a_point() -> None:
@@ -82,7 +82,7 @@ def test_keypoints_are_measured_from_where_the_answer_puts_a_point() -> None:
     second, after = scene.collapse.model.correspondences.fixed, known.DEF_FROM_CT(CT)
     for point, before, one in zip(after, BEFORE, got, strict=True):
         far = np.linalg.norm(second - point, axis=1)
-        missed = 0.01 * MISSED[np.argsort(far)[:6]].mean()
+        missed = MISSED[np.argsort(far)[:6]].mean()
         sigma = 1.5 * missed + 0.15 * max(far.min() - 8.0, 0.0)
         assert_allclose(one, known.modelled(before[None], sigma)[0], rtol=1e-6)
 

@@ -98,6 +98,7 @@ def nearest_correspondences(collapse: Collapse, deflated: Array) -> tuple[Array,
 
 def correspondence_sigma_mm(distance_mm: Array, misfit_mm: Array) -> Array:
     """Standard deviation (n,) mm per axis of tissue at a distance (n,) from the nearest keypoint, where the result
-    misses the nearest keypoints by a misfit (n,).
+    misses the nearest keypoints by a misfit (n,). At least that of the registration that matches keypoints.
     """
-    return PER_MISFIT * misfit_mm + PER_MM * np.maximum(distance_mm - REACH_MM, 0.0)
+    told = PER_MISFIT * misfit_mm + PER_MM * np.maximum(distance_mm - REACH_MM, 0.0)
+    return np.maximum(told, REGISTRATION_MM)
