@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
+from registration import sliding
 from registration.correspondences import Correspondences
-from registration.ffd import FfdSettings, Weights, register_ffd
+from registration.ffd import FfdFit, FfdSettings, Weights, register_ffd
 from registration.images.morphology import dilate
 from registration.maps.bspline import BSplineField, control_grid
+from registration.maps.composite import CompositeTransform
 from registration.maps.rigid import RigidTransform
 from registration.sliding import finest_weights, masked, register_sliding
 from registration.terms.gauss_newton import Stop
@@ -146,6 +149,35 @@ def test_a_lung_slides_past_a_wall_that_stays() -> None:
     assert error(led.moving_from_fixed(near), fit.moving_from_fixed(near)).max() > 0.01  # not the same registrations
     plain = register_ffd(fixed, moving, COARSE)
     assert error(plain.moving_from_fixed(near), near + slide).mean() > 2.0
+
+
+@pytest.mark.parametrize(
+    ("count", "limit", "coarse"), [(30, 9.0, True), (30, 11.0, False), (19, 11.0, True), (0, 1000.0, True)]
+)
+def test_the_coarse_levels_run_where_matches_moved_far_or_are_too_few(
+    monkeypatch: pytest.MonkeyPatch, count: int, limit: float, coarse: bool
+) -> None:
+    points = INNER[:count]
+    matches = Correspondences.of(points, points + np.array([0.0, 0.0, 10.0]))
+    still = CompositeTransform(RigidTransform.identity(), BSplineField(np.zeros((4, 4, 4, 3)), np.eye(4)))
+    asked: list[dict[str, Any]] = []
+
+    def register(*_images: Volume, **named: Any) -> FfdFit:
+        asked.append(named)
+        return FfdFit(still, Stop.CONVERGED, (), 1.0, 0.0, 1.0)
+
+    monkeypatch.setattr(sliding, "match_keypoints", lambda *_values, **_named: matches)
+    monkeypatch.setattr(sliding, "register_ffd", register)
+    blank = Volume(np.full(GRID.shape, -700, np.float32), GRID.ras_from_ijk)
+    lung = Mask(np.linalg.norm(GRID.points() - CENTRE, axis=-1) < 20, GRID.ras_from_ijk)
+    fit = register_sliding(blank, blank, lung, COARSE, fixed_lung=lung, coarse_beyond_mm=limit)
+    assert fit.coarse is coarse
+    assert len(asked) == 1 + coarse
+    enough = count >= 20
+    assert fit.matched == (count if enough else 0)
+    assert fit.moved_mm == (pytest.approx(10.0) if enough else np.inf)
+    for named in asked:
+        assert (named["matches"] is not None) is enough
 
 
 def test_bare_tissue_follows_the_depth_and_not_a_tapering_wall() -> None:
