@@ -13,7 +13,6 @@ from pathlib import Path
 
 import meshio
 import numpy as np
-import trimesh
 
 from registration.volume import Array
 from vatsloc.errors import CaseError, InputRefused
@@ -96,8 +95,9 @@ def read_surface(path: Path) -> Surface:
     if suffix != ".stl":
         raise CaseError(f"{path} is no surface file; give an .stl, or points in a .mrk.json.")
     try:
-        mesh = trimesh.load_mesh(path, file_type="stl")
-        points, triangles = np.asarray(mesh.vertices, dtype=float), np.asarray(mesh.faces, dtype=int)
+        with np.errstate(over="ignore"):  # meshio takes bytes of a text file for a count and multiplies it
+            mesh = meshio.stl.read(path)  # a corner that triangles share is one point
+        points, triangles = np.asarray(mesh.points, dtype=float), np.asarray(mesh.cells[0].data, dtype=int)
     except Exception as error:
         raise InputRefused(f"{path} is not a readable STL surface ({error}); export it again.") from error
     if len(triangles) == 0 or not np.isfinite(points).all():
