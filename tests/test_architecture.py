@@ -58,7 +58,8 @@ ROOMS: dict[str, dict[str, set[str]]] = {
             *("errors", "frames", "lazy", "maps", "terminal", "formats", "imaging", "case", "results", "report"),
             *("workflow", "evaluation", "synthetic"),
         },
-        "cli": {"errors", "terminal", "workflow", "evaluation", "synthetic", "study"},
+        "phantom_command": {"errors", "terminal", "synthetic", "study"},
+        "cli": {"errors", "terminal", "phantom_command", "workflow", "evaluation", "synthetic", "study"},
         "__main__": {"cli"},
     },
 }

@@ -13,6 +13,7 @@ import typer
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from vatsloc.errors import CaseError, GateFailed, VatslocError
+from vatsloc.phantom_command import phantom
 from vatsloc.study.commands import bench, stability
 from vatsloc.terminal import JsonOption, say, show
 
@@ -25,6 +26,7 @@ app = typer.Typer(
 
 app.add_typer(bench, name="bench")
 app.add_typer(stability, name="stability")
+app.command()(phantom)
 
 CaseArgument = Annotated[Path, typer.Argument(metavar="CASE", help="Case folder with case.toml.")]
 
@@ -92,66 +94,6 @@ def cohort(
         show(cohort_json(outcomes))
     else:
         print(table(outcomes))
-
-
-@app.command()
-def phantom(
-    name: Annotated[str | None, typer.Argument(metavar="NAME", help="Name of the phantom, for instance demo.")] = None,
-    out: Annotated[Path | None, typer.Option("--out", metavar="CASE", help="Case folder to write.")] = None,
-    seed: Annotated[int, typer.Option(metavar="N", help="Seed of the anatomy.")] = 0,
-    suite: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Write every case of the suite; those there are kept.")
-    ] = None,
-    jobs: Annotated[int, typer.Option(metavar="N", min=1, help="Cases of the suite made at once.")] = 1,
-    sheet: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Contact sheet of the suite to write, PNG or JPEG.")
-    ] = None,
-    beside: Annotated[
-        Path | None, typer.Option(metavar="CASE", help="Case made from a real scan that the sheet shows first.")
-    ] = None,
-    from_ct: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Chest CT to make a twin of, collapsed like NAME if given.")
-    ] = None,
-    side: Annotated[
-        str, typer.Option(metavar="SIDE", help="Lung of the twin that collapses: right or left.")
-    ] = "right",
-    nodule: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Mask of the nodule in the CT; else one is put in.")
-    ] = None,
-    series: Annotated[
-        int | None, typer.Option(metavar="N", min=10, max=100, help="Breathe the twin instead: N states of one breath.")
-    ] = None,
-    cbct: Annotated[
-        str, typer.Option(metavar="DOMAIN", help='Scanner: image, or projection for a C-arm (extra "projections").')
-    ] = "image",
-) -> None:
-    """Write a synthetic case with known truth, the whole suite with a table of how hard its cases are, or the twin of a
-    scan: collapsed, or breathing."""
-    from vatsloc.study.cohort.contact_sheet import write_sheet
-    from vatsloc.study.cohort.suite import table, write_suite
-    from vatsloc.synthetic.case import side_named, write_phantom, write_twin
-    from vatsloc.synthetic.series import write_series
-
-    moving = side_named(side)
-    if suite is not None and (name, out, from_ct) == (None, None, None):
-        made = write_suite(suite, jobs, say, cbct)
-        if sheet is not None:
-            write_sheet([suite / case for case in made], sheet, beside=beside)
-        print(table(made))
-    elif suite is None and out is not None and from_ct is not None:
-        if series is None:
-            write_twin(from_ct, moving, out, name, seed, nodule, say, cbct)
-        else:
-            write_series(from_ct, moving, out, series, seed, say)
-        print(out)
-    elif suite is None and from_ct is None and name is not None and out is not None:
-        write_phantom(name, out, seed, say, cbct)
-        print(out)
-    else:
-        raise CaseError(
-            "phantom makes one case (NAME --out CASE), the suite (--suite DIR) or a twin (--from-ct FILE --out CASE); "
-            "give one of the three."
-        )
 
 
 @app.command()
