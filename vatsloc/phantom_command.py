@@ -72,7 +72,7 @@ def phantom(
 
 
 def mode_of(given: set[str]) -> Mode:
-    """The mode of the parameters given on the command line; raises CaseError where one lacks or does not belong there."""
+    """The mode of the parameters given on the command line; raises CaseError where one lacks or belongs elsewhere."""
     mode = next((MODES[key] for key in ("suite", "series", "from_ct") if key in given), MODES["name"])
     lacking, strange = mode.needed - given, given - mode.allowed
     if lacking or strange:
