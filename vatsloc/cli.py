@@ -13,7 +13,8 @@ import typer
 # Before numpy is first imported: a lung's fronts are too small to share, and waiting threads burn the other core.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-from vatsloc.errors import CaseError, GateFailed, as_ours
+from vatsloc.errors import GateFailed, as_ours
+from vatsloc.phantom_command import phantom
 from vatsloc.study.commands import bench, stability
 from vatsloc.terminal import JsonOption, say, show
 
@@ -25,6 +26,7 @@ app = typer.Typer(
 
 app.add_typer(bench, name="bench")
 app.add_typer(stability, name="stability")
+app.command()(phantom)
 
 DEBUG = "--debug"
 
@@ -114,8 +116,8 @@ def cohort(
     as_json: JsonOption = False,
 ) -> None:
     """Localize and score many cases; one table of errors, gates, seconds and memory as CSV, Markdown and HTML."""
-    from vatsloc.study.cohort import as_json as cohort_json
-    from vatsloc.study.cohort import find_cases, run_cohort, table
+    from vatsloc.study.cohort.cohort import as_json as cohort_json
+    from vatsloc.study.cohort.cohort import find_cases, run_cohort, table
     from vatsloc.workflow.settings import load_settings
 
     load_settings(preset, settings)
@@ -127,66 +129,6 @@ def cohort(
 
 
 @app.command()
-def phantom(
-    name: Annotated[str | None, typer.Argument(metavar="NAME", help="Name of the phantom, for instance demo.")] = None,
-    out: Annotated[Path | None, typer.Option("--out", metavar="CASE", help="Case folder to write.")] = None,
-    seed: Annotated[int, typer.Option(metavar="N", help="Seed of the anatomy.")] = 0,
-    suite: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Write every case of the suite; those there are kept.")
-    ] = None,
-    jobs: Annotated[int, typer.Option(metavar="N", min=1, help="Cases of the suite made at once.")] = 1,
-    sheet: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Contact sheet of the suite to write, PNG or JPEG.")
-    ] = None,
-    beside: Annotated[
-        Path | None, typer.Option(metavar="CASE", help="Case made from a real scan that the sheet shows first.")
-    ] = None,
-    from_ct: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Chest CT to make a twin of, collapsed like NAME if given.")
-    ] = None,
-    side: Annotated[
-        str, typer.Option(metavar="SIDE", help="Lung of the twin that collapses: right or left.")
-    ] = "right",
-    nodule: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Mask of the nodule in the CT; else one is put in.")
-    ] = None,
-    series: Annotated[
-        int | None, typer.Option(metavar="N", min=10, max=100, help="Breathe the twin instead: N states of one breath.")
-    ] = None,
-    cbct: Annotated[
-        str, typer.Option(metavar="DOMAIN", help='Scanner: image, or projection for a C-arm (extra "projections").')
-    ] = "image",
-) -> None:
-    """Write a synthetic case with known truth, the whole suite with a table of how hard its cases are, or the twin of a
-    scan: collapsed, or breathing."""
-    from vatsloc.phantom_case import side_named, write_phantom, write_twin
-    from vatsloc.phantom_series import write_series
-    from vatsloc.study.contact_sheet import write_sheet
-    from vatsloc.study.suite import table, write_suite
-
-    moving = side_named(side)
-    if suite is not None and (name, out, from_ct) == (None, None, None):
-        made = write_suite(suite, jobs, say, cbct)
-        if sheet is not None:
-            write_sheet([suite / case for case in made], sheet, beside=beside)
-        print(table(made))
-    elif suite is None and out is not None and from_ct is not None:
-        if series is None:
-            write_twin(from_ct, moving, out, name, seed, nodule, say, cbct)
-        else:
-            write_series(from_ct, moving, out, series, seed, say)
-        print(out)
-    elif suite is None and from_ct is None and name is not None and out is not None:
-        write_phantom(name, out, seed, say, cbct)
-        print(out)
-    else:
-        raise CaseError(
-            "phantom makes one case (NAME --out CASE), the suite (--suite DIR) or a twin (--from-ct FILE --out CASE); "
-            "give one of the three."
-        )
-
-
-@app.command()
 def demo(
     out: Annotated[
         Path, typer.Option("--out", metavar="DIR", help="Folder for the phantom case and its result.")
@@ -194,7 +136,7 @@ def demo(
 ) -> None:
     """Make a phantom, localize its nodule with the fast preset, score it and say where the report is."""
     from vatsloc.evaluation import evaluate_case, table
-    from vatsloc.phantom_case import write_phantom
+    from vatsloc.synthetic.case import write_phantom
     from vatsloc.workflow.run import run_case
     from vatsloc.workflow.settings import load_settings
 
@@ -219,9 +161,9 @@ def chart(
     ] = "seconds",
 ) -> None:
     """Errors against seconds of the method's variants over CASES; goes on where it was stopped (extra "report")."""
-    from vatsloc.study.chart import run_chart
-    from vatsloc.study.chart_draw import require_matplotlib, write_chart
-    from vatsloc.study.chart_variants import VARIANTS, chosen_variants
+    from vatsloc.study.chart.chart import run_chart
+    from vatsloc.study.chart.draw import require_matplotlib, write_chart
+    from vatsloc.study.chart.variants import VARIANTS, chosen_variants
 
     require_matplotlib()
     chosen = chosen_variants([name.strip() for name in variants.split(",")] if variants else None)
@@ -238,10 +180,10 @@ def paper(
     jobs: Annotated[int, typer.Option(metavar="N", min=1, help="Cases run at once.")] = 1,
 ) -> None:
     """The experiments of Alvarez 2021 on cases with truth: variants A to C, diaphragm, parameters (extra "report")."""
-    from vatsloc.study.chart_draw import require_matplotlib
-    from vatsloc.study.cohort import find_cases
-    from vatsloc.study.paper import run_paper
-    from vatsloc.study.paper_draw import write_paper
+    from vatsloc.study.chart.draw import require_matplotlib
+    from vatsloc.study.cohort.cohort import find_cases
+    from vatsloc.study.paper.draw import write_paper
+    from vatsloc.study.paper.paper import run_paper
 
     require_matplotlib()
     write_paper(run_paper(find_cases(folders), out, jobs, say), out)

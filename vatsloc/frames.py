@@ -21,10 +21,14 @@ permutes and reverses an array without moving a voxel in space.
 from __future__ import annotations
 
 from itertools import permutations
+from typing import Literal
 
 import numpy as np
 
 from registration.volume import Array
+
+Side = Literal["left", "right"]
+"""Of the patient."""
 
 FLIP = np.diag([-1.0, -1.0, 1.0, 1.0])
 """(4, 4): RAS to LPS and back."""

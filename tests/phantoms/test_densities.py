@@ -12,7 +12,7 @@ from phantoms import PhantomCase
 from registration.volume import Volume
 from vatsloc.formats.images import read_volume
 from vatsloc.imaging.lungs import segment_lungs
-from vatsloc.phantom_voxels import to_volume
+from vatsloc.synthetic.voxels import to_volume
 
 TISSUE_HU, VESSEL_HU, BONE_HU, HARD_BONE_HU = -300.0, -500.0, 200.0, 600.0
 

@@ -16,7 +16,7 @@ from phantoms.projection import WATER_PER_MM, CArm, c_arm_of, develop, expose_vi
 from phantoms.scanner_figures import scanner_figures
 from phantoms.voxels import Array, Image
 from vatsloc.errors import CaseError
-from vatsloc.phantom_case import scanned
+from vatsloc.synthetic.case import scanned
 
 needs_rtk = pytest.mark.skipif(find_spec("itk") is None, reason='itk-rtk is not here (extra "projections")')
 SCANNER = Scanner(fov=160.0, length=60.0)
@@ -128,7 +128,7 @@ def test_without_rtk_and_for_other_domains_one_is_told(monkeypatch: pytest.Monke
         scanned(SPECS["demo"], "sound")
     with pytest.raises(ValueError, match="domain must be 'image' or 'projection', got 'sound'"):
         make_case(replace(SPECS["demo"], scanner=Scanner(domain="sound")))
-    monkeypatch.setattr("vatsloc.phantom_case.find_spec", lambda _name: None)
+    monkeypatch.setattr("vatsloc.synthetic.case.find_spec", lambda _name: None)
     with pytest.raises(CaseError, match=r"get it by pip install \"vatsloc\[projections\]\""):
         scanned(SPECS["demo"], "projection")
     projection._itk.cache_clear()

@@ -14,10 +14,10 @@ from phantoms.measures import affine_share
 from phantoms.states import lung_body, make_states
 from phantoms.thorax import draw_thorax
 from vatsloc.errors import CaseError
-from vatsloc.phantom_case import read_info, recipe, write_phantom
 from vatsloc.report.planes import box_of
-from vatsloc.study import suite
-from vatsloc.study.contact_sheet import HEIGHT, LABEL, write_sheet
+from vatsloc.study.cohort import suite
+from vatsloc.study.cohort.contact_sheet import HEIGHT, LABEL, write_sheet
+from vatsloc.synthetic.case import read_info, recipe, write_phantom
 
 
 def test_suite_covers_the_clinic() -> None:
@@ -67,7 +67,7 @@ def test_pleura_that_has_grown_to_the_chest_wall_goes_with_it_and_no_other_does(
 def test_a_case_that_is_there_is_kept_and_tabled(
     demo: PhantomCase, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("vatsloc.phantom_case.make_case", lambda _name, _seed: demo)
+    monkeypatch.setattr("vatsloc.synthetic.case.make_case", lambda _name, _seed: demo)
     monkeypatch.setattr(suite, "SUITE", {"demo": 0})
     write_phantom("demo", tmp_path / "demo")
     ct = tmp_path / "demo" / "ct.nii.gz"

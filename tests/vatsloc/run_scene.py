@@ -35,7 +35,7 @@ from vatsloc.imaging.cbct import Cupping, FieldOfView, PreparedCbct
 from vatsloc.imaging.side import PleuralGas
 from vatsloc.imaging.surface import Border, SurfacePoints
 from vatsloc.workflow.hilum import HilumMotion, HilumSource
-from vatsloc.workflow.ladder import Model
+from vatsloc.workflow.model_selection import CollapseModel
 from vatsloc.workflow.observe import Observed
 from vatsloc.workflow.pneumothorax import Collapse
 from vatsloc.workflow.pose import ChangeOfPose
@@ -186,7 +186,7 @@ class Scene:
 
 @lru_cache(maxsize=1)
 def scene() -> Scene:
-    """The run, without a residual registration and without places found again."""
+    """The run, without a residual registration and without keypoints."""
     lung = ball_mesh(CENTRE, RADIUS_MM, 12.0)
     return Scene(_case(), _prepared(), _pose(lung), _collapse(lung))
 
@@ -275,9 +275,9 @@ def _collapse(lung: TetMesh) -> Collapse:
         hilum_nodes=np.array([2, 3]),
         motion=HilumMotion(np.array([[1.0, 2, 3], [3.0, 6, 5]]), HilumSource.AIRWAYS),
     )
-    found_again, others = Correspondences.of(nothing, nothing), np.zeros((0, *model_mesh.points.shape))
+    matched, ensemble = Correspondences.of(nothing, nothing), np.zeros((0, *model_mesh.points.shape))
     still = np.zeros_like(model_mesh.points)
-    model = Model(system, _fit(model_mesh), still, found_again, (), solid, others)
+    model = CollapseModel(system, _fit(model_mesh), still, matched, (), solid, ensemble)
     return Collapse(observed, model, None, after.points)
 
 

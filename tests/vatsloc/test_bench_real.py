@@ -15,12 +15,12 @@ from poro.arrays import Array
 from poro.mesh import TetMesh
 from registration.volume import Mask
 from vatsloc.errors import CaseError, InputRefused
-from vatsloc.study import bench_real as bench
-from vatsloc.study import real_draw
-from vatsloc.study.affine import affine_to_points, affine_to_shape
-from vatsloc.study.breathing import Lung
-from vatsloc.study.breaths import EXPIRATION, INSPIRATION, LANDMARKS, Marks, read_person, to_the_back
-from vatsloc.study.poro_lung import lung, wall_level
+from vatsloc.study.bench import real as bench
+from vatsloc.study.bench import real_draw
+from vatsloc.study.bench.affine import affine_to_points, affine_to_shape
+from vatsloc.study.bench.breathing import Lung
+from vatsloc.study.bench.breaths import EXPIRATION, INSPIRATION, LANDMARKS, Marks, read_person, to_the_back
+from vatsloc.study.bench.poro_lung import lung, wall_level
 
 CENTRES = {"left": np.array([-65.0, 0.0, 0.0]), "right": np.array([65.0, 0.0, 0.0])}
 SQUEEZE = np.diag([0.9, 0.85, 0.88])

@@ -13,9 +13,9 @@ from registration.volume import Array, Mask, Volume
 from tests.registration.scenes import image_of, make_pattern, oriented
 from vatsloc.imaging.cbct import PreparedCbct, prepare_cbct
 from vatsloc.maps import MeshMap
-from vatsloc.workflow.certainty import widened
 from vatsloc.workflow.check import Checks, check_gates, compare, worst_mm
 from vatsloc.workflow.settings import GateSettings
+from vatsloc.workflow.uncertainty import widened
 
 CENTRE = np.array([10.0, -5.0, 30.0])
 AROUND = RigidTransform.about(CENTRE, np.array([0.1, 0.0, -0.15]), np.array([20.0, -8.0, 12.0]))

@@ -13,8 +13,8 @@ from phantoms.spec import SPECS, Collapse, Lesion, PhantomSpec
 from registration.correspondences import Correspondences
 from registration.sliding import moved_mm
 from tests.vatsloc.ball_scene import sliding_fit
-from vatsloc.phantom_case import write_phantom
-from vatsloc.study.choices import LIMITS, Tried, table, try_choices
+from vatsloc.study.stability.choices import LIMITS, Tried, table, try_choices
+from vatsloc.synthetic.case import write_phantom
 from vatsloc.workflow.choices import Choice, weigh
 from vatsloc.workflow.pneumothorax import RESIDUAL
 from vatsloc.workflow.pose import FIRST, moved_far
@@ -72,7 +72,7 @@ def test_places_that_moved_little_against_the_spine_make_the_first_registration_
     assert not moved_far(matched, 5.1).kept
     assert moved_far(matched, 4.9).kept
     assert moved_far(matched, 5.1).value == pytest.approx(5)
-    assert moved_far(matched, 5.1).why.startswith("95 % of 100 places inside the lung moved by at most 5.0 mm")
+    assert moved_far(matched, 5.1).why.startswith("95 % of 100 keypoints inside the lung moved by at most 5.0 mm")
     none = sliding_fit(0, moved_mm(None, spine))
     assert moved_far(none, 100.0).kept
     assert moved_far(none, 100.0).value == inf

@@ -15,7 +15,7 @@ from registration.volume import Volume
 from vatsloc.cli import main
 from vatsloc.formats.images import read_volume
 from vatsloc.formats.nifti import write_volume
-from vatsloc.phantom_case import write_phantom
+from vatsloc.synthetic.case import write_phantom
 
 
 @pytest.fixture(scope="module")

@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 
 from vatsloc.errors import CaseError
-from vatsloc.study import bench_fit as fits
-from vatsloc.study.cohort import Outcome, as_json, find_cases, run_cohort, summary, table
+from vatsloc.study.bench import fit as fits
+from vatsloc.study.cohort.cohort import Outcome, as_json, find_cases, run_cohort, summary, table
 
 PROGRAM = """
 import json, os, signal, sys

@@ -16,7 +16,7 @@ from registration.volume import Mask
 from tests.vatsloc import run_scene as known
 from vatsloc.errors import NotConverged
 from vatsloc.workflow.hilum import HilumSource
-from vatsloc.workflow.localize import Localization, conclude
+from vatsloc.workflow.localization import Localization, locate_nodule
 from vatsloc.workflow.settings import settings_of
 from vatsloc.workflow.stages import Stages
 
@@ -25,7 +25,7 @@ NO_RESIDUAL = "Too little lung is seen in both CBCTs"
 
 def concluded(scene: known.Scene, log: Stages | None = None, **limits: float) -> Localization:
     settings = settings_of("balanced", {"gates": limits})
-    return conclude(scene.case, scene.prepared, scene.pose, scene.collapse, settings, log or Stages())
+    return locate_nodule(scene.case, scene.prepared, scene.pose, scene.collapse, settings, log or Stages())
 
 
 def spread() -> tuple[Any, Any]:

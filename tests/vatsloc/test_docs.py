@@ -80,6 +80,13 @@ def test_extend_page_s_metric_and_material_hold_what_it_asserts() -> None:
     assert names["material"].name == "neo-Hookean with a quadratic bulk term"
 
 
+@pytest.mark.parametrize("page", ["glossary.md", "method.md"])
+def test_files_that_a_page_names_are_there(page: str) -> None:
+    named = re.findall(r"`([a-z]\w*/[\w/]+(?:\.py)?)`", (ROOT / "docs" / page).read_text(encoding="utf-8"))
+    assert len(named) > 20
+    assert [name for name in named if not (ROOT / name).exists()] == []
+
+
 @pytest.mark.parametrize("page", [*PAGES, ROOT / "README.md"], ids=lambda page: page.name)
 def test_commands_of_a_page_are_understood(page: Path) -> None:
     text = page.read_text(encoding="utf-8")

@@ -177,10 +177,10 @@ def test_a_landmark_is_in_view_where_both_images_show_it(scores: Evaluation) -> 
         assert scores.summary["inside_fov"][measure]["n"] == np.isfinite(mm).sum()
 
 
-@pytest.mark.parametrize("blind", ["inflated", "deflated"])
-def test_either_image_alone_can_put_a_landmark_out_of_view(result: Result, blind: str) -> None:
+@pytest.mark.parametrize("training_only", ["inflated", "deflated"])
+def test_either_image_alone_can_put_a_landmark_out_of_view(result: Result, training_only: str) -> None:
     at = {"inflated": INFLATED_AT, "deflated": DEFLATED_AT}
-    views = {name: slab(where, 14.0 if name == blind else 60.0) for name, where in at.items()}
+    views = {name: slab(where, 14.0 if name == training_only else 60.0) for name, where in at.items()}
     seen = evaluate(replace(truth(), fields_of_view=views), result).inside_fov
     assert seen.tolist() == [True] * 4 + [False] * 8
 

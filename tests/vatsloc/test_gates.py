@@ -13,8 +13,8 @@ from registration.volume import Mask
 from tests.vatsloc import run_scene as known
 from vatsloc.imaging.surface import Border
 from vatsloc.workflow.gates import Gate
-from vatsloc.workflow.ladder import Rung
-from vatsloc.workflow.localize import in_view, quality_gates, surface_distances
+from vatsloc.workflow.model_selection import Refinement
+from vatsloc.workflow.quality import in_view, quality_gates, surface_distances
 from vatsloc.workflow.settings import GateSettings
 from vatsloc.workflow.stages import Stages
 
@@ -30,7 +30,7 @@ MEASURED = {
     "deflated_surface": (5, "min_surface_points"),
     "fissures": (2 / 7, "max_fissure_share"),
     "surface": (1.75, "max_surface_mm"),
-    "held_back": (3.5, "max_held_back_mm"),
+    "held_out": (3.5, "max_held_out_mm"),
     "agreement": (0.75, "min_agreement"),
     "model_error": (2.5, "max_model_error_mm"),
 }
@@ -43,7 +43,7 @@ SAYS = {
     "deflated_surface": "Too little of the collapsed lung",
     "fissures": "Lobes have come apart",
     "surface": "stays off the observed one",
-    "held_back": "does not predict",
+    "held_out": "does not predict",
     "agreement": "disagree",
     "model_error": "contradict the model",
 }
@@ -56,7 +56,7 @@ LENIENT = GateSettings(
 def scene() -> known.Scene:
     """The known run with every part that a gate looks at; a quarter of its tetrahedra are turned inside out."""
     base = known.scene().with_model(
-        rungs=(Rung("regional", 4.0, 3.5, True), Rung("elastic", 3.5, 2.75, False)),
+        refinements=(Refinement("regional", 4.0, 3.5, True), Refinement("elastic", 3.5, 2.75, False)),
     )
     base = base.with_collapse(residual=known.corrected(base.pose.mesh_ct))
     mesh = base.collapse.mesh_before
@@ -116,7 +116,7 @@ def test_limits_are_those_of_the_documentation() -> None:
         "max_fissure_share": 0.1,
         "min_agreement": 0.5,
         "max_model_error_mm": 10.0,
-        "max_held_back_mm": 5.0,
+        "max_held_out_mm": 5.0,
         "max_ellipsoid_mm": 15.0,
         "max_out_of_view_mm": 10.0,
         "max_left_over_mm": 4.0,
@@ -148,13 +148,13 @@ def test_parts_that_did_not_run_have_no_gates(scene: known.Scene) -> None:
     every = set(MEASURED)
     assert set(gates_of(scene.with_pose(ffd=None))) == every - {"registration_folds"}
     assert set(gates_of(scene.with_collapse(residual=None))) == every - {"agreement", "model_error"}
-    assert set(gates_of(scene.with_model(rungs=()))) == every - {"held_back"}
+    assert set(gates_of(scene.with_model(refinements=()))) == every - {"held_out"}
 
 
-def test_held_back_misfit_is_that_of_the_last_step_taken(scene: known.Scene) -> None:
+def test_held_out_misfit_is_that_of_the_last_step_taken(scene: known.Scene) -> None:
     for kept, expected in (((False, False), 4.0), ((True, False), 3.5), ((True, True), 2.75), ((False, True), 2.75)):
-        rungs = (Rung("regional", 4.0, 3.5, kept[0]), Rung("elastic", 3.5, 2.75, kept[1]))
-        assert gates_of(scene.with_model(rungs=rungs))["held_back"].value == expected
+        refinements = (Refinement("regional", 4.0, 3.5, kept[0]), Refinement("elastic", 3.5, 2.75, kept[1]))
+        assert gates_of(scene.with_model(refinements=refinements))["held_out"].value == expected
 
 
 def test_where_no_air_is_seen_surface_gates_fail(scene: known.Scene) -> None:

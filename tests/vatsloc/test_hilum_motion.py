@@ -145,9 +145,9 @@ def test_a_registration_that_goes_astray_folds_or_cannot_be_turned_round_gives_w
 
 
 def test_airways_that_the_inflated_scan_does_not_see_move_the_hilum_as_a_whole(monkeypatch: pytest.MonkeyPatch) -> None:
-    def blind(*_args: Any, **_rest: Any) -> Any:
+    def training_only(*_args: Any, **_rest: Any) -> Any:
         raise ValueError("no sample")
 
-    moved = found(monkeypatch, blind)  # type: ignore[arg-type]
+    moved = found(monkeypatch, training_only)  # type: ignore[arg-type]
     assert moved.source is HilumSource.FEW
     assert_allclose(moved.displacement, np.broadcast_to(AS_A_WHOLE, POINTS.shape))

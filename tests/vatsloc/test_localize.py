@@ -25,8 +25,8 @@ from vatsloc.formats.markups import read_points
 from vatsloc.formats.meshes import read_vtu
 from vatsloc.formats.transforms import read_tfm
 from vatsloc.maps import MeshMap, covered
-from vatsloc.phantom_case import write_phantom
 from vatsloc.results import OUTPUT_FILES
+from vatsloc.synthetic.case import write_phantom
 from vatsloc.workflow.run import run_case
 from vatsloc.workflow.settings import load_settings
 
@@ -47,7 +47,7 @@ def case(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def blind_case(case: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same case with nonsense for landmarks and truth: who reads them stumbles."""
-    folder = tmp_path_factory.mktemp("blind") / "demo"
+    folder = tmp_path_factory.mktemp("training_only") / "demo"
     shutil.copytree(case, folder)
     for path in (*folder.glob("landmarks_*"), *folder.glob("truth/*")):
         path.write_bytes(b"nonsense")
@@ -93,7 +93,7 @@ def test_the_run_is_done_and_every_gate_holds(run: dict[str, Any]) -> None:
     assert run["status"] == "done"
     spine = {f"spine_{kind}{pair}" for kind in ("", "slip_") for pair in ("ct_inflated", "inflated_deflated")}
     seen = {"overlap", "deflated_surface", "surface", "fissures", "nodule_in_view"}
-    believed = {"registration_folds", "inverted_elements", "held_back", "agreement", "model_error", "ellipsoid"}
+    believed = {"registration_folds", "inverted_elements", "held_out", "agreement", "model_error", "ellipsoid"}
     checked = {"check_phase1", "recognized_phase1", "check", "recognized"}
     assert set(run["gates"]) == spine | seen | believed | checked
 

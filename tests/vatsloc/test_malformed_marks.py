@@ -21,7 +21,7 @@ from vatsloc.formats.casefile import read_case_file
 from vatsloc.formats.markups import PointList, read_points, write_points
 from vatsloc.formats.meshes import Surface, TetraMesh, read_surface, read_vtu, write_stl, write_vtu
 from vatsloc.formats.transforms import read_tfm, write_tfm
-from vatsloc.study.breaths import _landmarks
+from vatsloc.study.bench.breaths import _landmarks
 
 POINTS = np.array([[10.0, 20, 30], [11.5, 20, 30], [10, 22.25, 30], [10, 20, 33]])
 TRIANGLES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])

@@ -15,21 +15,21 @@ from registration.correspondences import Correspondences
 from registration.volume import Array
 from tests.vatsloc import ball_scene as scene
 from vatsloc.workflow import pneumothorax as module
-from vatsloc.workflow.ladder import Model, Rung
+from vatsloc.workflow.model_selection import CollapseModel, Refinement
 from vatsloc.workflow.pneumothorax import RESIDUAL, Collapse, collapse, contact_surface, pneumothorax
 from vatsloc.workflow.pose import ChangeOfPose
 from vatsloc.workflow.residual import Residual
 from vatsloc.workflow.settings import settings_of
 from vatsloc.workflow.stages import Stages
 
-TRIED = Rung("regional fit", 3.0, 2.0, False)
-KEPT = Rung("elastic correction", 3.0, 1.2, True)
+TRIED = Refinement("regional fit", 3.0, 2.0, False)
+KEPT = Refinement("elastic correction", 3.0, 1.2, True)
 
 
 class Parts:
     """A pose, what was observed and a model that moves its own, coarser mesh by the scene's affine collapse."""
 
-    def __init__(self, rungs: Sequence[Rung] = ()) -> None:
+    def __init__(self, refinements: Sequence[Refinement] = ()) -> None:
         mesh, both = scene.lung_mesh(), (scene.INF_FROM_CT, scene.DEF_FROM_INF)
         inflated, before = scene.placed(mesh, *both[:1]), scene.placed(mesh, *both)
         coarse = scene.placed(scene.lung_mesh(7.0), *both)
@@ -58,14 +58,14 @@ class Parts:
         system: Any = SimpleNamespace(mesh=coarse)
         nothing: Any = None
         moved = scene.collapsed(coarse.points) - coarse.points
-        self.model = Model(system, nothing, moved, self.pairs, tuple(rungs), nothing, np.zeros((0, 0, 3)))
+        self.model = CollapseModel(system, nothing, moved, self.pairs, tuple(refinements), nothing, np.zeros((0, 0, 3)))
         self.asked: list[tuple[Any, ...]] = []
 
     def run(self, monkeypatch: pytest.MonkeyPatch, images: Residual | None, **tables: Any) -> Collapse:
         case: Any = SimpleNamespace(gravity_ras=np.array([1.0, 0, 0]))
         settings = settings_of("balanced", tables)
 
-        def climb(gravity: Array, *rest: Any) -> Model:
+        def select_model(gravity: Array, *rest: Any) -> CollapseModel:
             assert_array_equal(gravity, case.gravity_ras)
             assert rest == (self.prepared, self.observed, settings, self.stages)
             return self.model
@@ -74,7 +74,7 @@ class Parts:
             self.asked.append(values)
             return images
 
-        monkeypatch.setattr(module, "climb", climb)
+        monkeypatch.setattr(module, "select_model", select_model)
         monkeypatch.setattr(module, "residual_registration", correct)
         return collapse(case, self.prepared, self.pose, self.observed, settings, self.stages)
 
@@ -119,12 +119,12 @@ def test_the_residual_registration_is_asked_in_the_frames_of_the_scans(monkeypat
 
 
 @pytest.mark.parametrize(
-    ("rungs", "asked", "levels"), [((), 3, 3), ((TRIED,), 3, 3), ((TRIED, KEPT), 3, 2), ((KEPT,), 1, 1)]
+    ("refinements", "asked", "levels"), [((), 3, 3), ((TRIED,), 3, 3), ((TRIED, KEPT), 3, 2), ((KEPT,), 1, 1)]
 )
 def test_a_model_that_follows_places_needs_one_level_less(
-    monkeypatch: pytest.MonkeyPatch, rungs: tuple[Rung, ...], asked: int, levels: int
+    monkeypatch: pytest.MonkeyPatch, refinements: tuple[Refinement, ...], asked: int, levels: int
 ) -> None:
-    parts = Parts(rungs)
+    parts = Parts(refinements)
     parts.run(monkeypatch, None, residual={"levels": asked})
     assert parts.asked[0][5].levels == levels
 
@@ -145,17 +145,18 @@ def test_without_images_the_answer_is_the_models(monkeypatch: pytest.MonkeyPatch
 
 
 @pytest.mark.parametrize(
-    ("rungs", "limit", "kept"), [((KEPT,), 1.1, True), ((KEPT,), 1.3, False), ((TRIED,), 2.9, True), ((), 90.0, True)]
+    ("refinements", "limit", "kept"),
+    [((KEPT,), 1.1, True), ((KEPT,), 1.3, False), ((TRIED,), 2.9, True), ((), 90.0, True)],
 )
 def test_a_model_that_predicts_unseen_places_makes_the_images_superfluous(
-    monkeypatch: pytest.MonkeyPatch, rungs: tuple[Rung, ...], limit: float, kept: bool
+    monkeypatch: pytest.MonkeyPatch, refinements: tuple[Refinement, ...], limit: float, kept: bool
 ) -> None:
-    parts = Parts(rungs)
+    parts = Parts(refinements)
     found = parts.run(monkeypatch, correction(parts), leave_out={"residual_mm": limit})
     assert (found.residual is not None) is kept
     (choice,) = parts.stages.choices
     assert (choice.part, choice.kept, choice.limit) == (RESIDUAL, kept, limit)
-    assert choice.value == (parts.model.held_back_mm if rungs else np.inf)
+    assert choice.value == (parts.model.held_out_mm if refinements else np.inf)
     assert (RESIDUAL in parts.stages.skipped) is not kept
 
 

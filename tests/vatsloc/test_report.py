@@ -145,7 +145,7 @@ def test_record_of_the_run_is_there(page):
 
 
 def test_what_was_chosen_is_told_with_its_reason():
-    rungs = [
+    refinements = [
         {"name": "regional", "before_mm": 3.214, "after_mm": 2.5, "kept": True},
         {"name": "elastic", "before_mm": 2.5, "after_mm": None, "kept": False},
     ]
@@ -154,17 +154,17 @@ def test_what_was_chosen_is_told_with_its_reason():
     page = words_alone(
         choices=[strain, strain | {"part": "extrapolation", "kept": True, "why": "unseen"}],
         skipped=skipped,
-        residuals={"ladder": rungs},
+        residuals={"model_selection": refinements},
     )
     assert "<dt>finite strain</dt><dd>left out: 0.02 % of the elements are out of range</dd>" in page
     assert "<summary>2 parts weighed, 1 left out as needless</summary>" in page
     assert page.count("0.02 % of the elements") == 1
     assert "<dt>left out: keypoints</dt><dd>switched off</dd>" in page
     assert (
-        "<dt>taken: regional</dt><dd>median misfit at places held back 3.21 mm without it, 2.5 mm with it</dd>" in page
+        "<dt>kept: regional</dt><dd>median misfit at held-out keypoints 3.21 mm without it, 2.5 mm with it</dd>" in page
     )
-    assert "<dt>not taken: elastic</dt>" in page
-    assert "taken:" not in words_alone()
+    assert "<dt>not kept: elastic</dt>" in page
+    assert "kept:" not in words_alone()
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ from vatsloc.workflow import residual
 from vatsloc.workflow.residual import Residual, _border_offsets, residual_registration
 from vatsloc.workflow.settings import ResidualSettings
 
-NO_PAIRS = Correspondences.of(np.zeros((0, 3)), np.zeros((0, 3)))
+NO_CORRESPONDENCES = Correspondences.of(np.zeros((0, 3)), np.zeros((0, 3)))
 NO_SURFACE = SurfacePoints(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0, dtype=np.int8))
 COARSE = ResidualSettings(voxel_mm=4.0, grid_mm=24.0, levels=1)
 FINE = ResidualSettings(levels=1)
@@ -56,7 +56,7 @@ def run(
     monkeypatch: pytest.MonkeyPatch,
     registration: Registration,
     surface: SurfacePoints = NO_SURFACE,
-    pairs: Correspondences = NO_PAIRS,
+    pairs: Correspondences = NO_CORRESPONDENCES,
     lung: Mask | None = None,
     settings: ResidualSettings = COARSE,
     **usable: Array,
@@ -83,7 +83,7 @@ def test_the_modelled_lung_comes_nearer_to_the_truth_inside_and_at_its_border() 
         Scene.before,
         scene.air_surface(),
         COARSE,
-        NO_PAIRS,
+        NO_CORRESPONDENCES,
     )
     assert found is not None
     left = np.linalg.norm(Scene.nodes + found.displacement - Scene.truth, axis=1)

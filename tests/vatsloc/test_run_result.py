@@ -16,8 +16,8 @@ from vatsloc.report.data import LUNG, SURFACE
 from vatsloc.results import ResultData
 from vatsloc.workflow.choices import Choice
 from vatsloc.workflow.gates import Gate
-from vatsloc.workflow.ladder import Rung
-from vatsloc.workflow.localize import Localization
+from vatsloc.workflow.localization import Localization
+from vatsloc.workflow.model_selection import Refinement
 from vatsloc.workflow.run import _fields, _nodule_mask, _pictures, _record, _residuals, _result
 from vatsloc.workflow.settings import Settings
 from vatsloc.workflow.stages import Stages
@@ -28,7 +28,7 @@ GATES = {"overlap": Gate(0.63, 0.4, True, "a"), "ellipsoid": Gate(6.0, 5.5, Fals
 
 
 def localization(scene: known.Scene) -> Localization:
-    """What `conclude` would make of a scene, with round numbers."""
+    """What `locate_nodule` would make of a scene, with round numbers."""
     return Localization(
         scene.prepared, scene.pose, scene.collapse, known.NODULE_INF, known.NODULE_DEF, ELLIPSOID_MM, AXES, GATES
     )
@@ -232,8 +232,10 @@ def test_residuals_hold_each_solvers_own_numbers() -> None:
     lung = known.scene().pose.mesh_ct
     away = np.full((2, *known.scene().collapse.system.mesh.points.shape), [3.0, 4.0, 0.0])
     away[1] = 0.0
-    rungs = (Rung("first", 4.0, 3.0, True), Rung("second", 3.0, 2.5, False))
-    scene = known.scene().with_collapse(residual=known.corrected(lung)).with_model(others=away, rungs=rungs)
+    refinements = (Refinement("first", 4.0, 3.0, True), Refinement("second", 3.0, 2.5, False))
+    scene = (
+        known.scene().with_collapse(residual=known.corrected(lung)).with_model(ensemble=away, refinements=refinements)
+    )
     run = _residuals(localization(scene))
     for name, ncc, other, overlap in (
         ("spine_ct_inflated", 0.81, 0.6, 0.93),
@@ -253,9 +255,9 @@ def test_residuals_hold_each_solvers_own_numbers() -> None:
     assert fit["volume_ratio"] == pytest.approx(known.DEF_FROM_INF.det)
     assert fit["pressure_layer"].startswith("The pressure layer, 8.7 mm")
     assert_allclose(fit["identifiability"]["sigma"], np.sqrt(np.diag(known.COVARIANCE)))
-    assert run["keypoints"] == {"found": 0, "held_back_mm": 3.0}
-    assert run["other_answers"] == {"number": 2, "rms_mm_at_nodule": pytest.approx(5 / np.sqrt(2))}
-    assert [rung["name"] for rung in run["ladder"]] == ["first", "second"]
+    assert run["keypoints"] == {"found": 0, "held_out_mm": 3.0}
+    assert run["perturbation_ensemble"] == {"number": 2, "rms_mm_at_nodule": pytest.approx(5 / np.sqrt(2))}
+    assert [refinement["name"] for refinement in run["model_selection"]] == ["first", "second"]
     assert run["residual_registration"] == {
         "seen_nodes": 30,
         "agreed_share": 0.75,
@@ -269,11 +271,11 @@ def test_residuals_hold_each_solvers_own_numbers() -> None:
     assert run["mesh"] == {"tetrahedra": len(lung.tets), "model_tetrahedra": tets}
 
 
-def test_what_other_answers_are_off_by_is_read_where_the_spine_puts_the_nodule() -> None:
+def test_what_the_ensemble_are_off_by_is_read_where_the_spine_puts_the_nodule() -> None:
     mesh = known.scene().collapse.system.mesh
-    scene = known.scene().with_model(others=(mesh.points - known.CENTRE)[None])
+    scene = known.scene().with_model(ensemble=(mesh.points - known.CENTRE)[None])
     placed = known.DEF_FROM_INF_RIGID(known.NODULE_INF[None])[0]
-    rms = _residuals(localization(scene))["other_answers"]["rms_mm_at_nodule"]
+    rms = _residuals(localization(scene))["perturbation_ensemble"]["rms_mm_at_nodule"]
     assert rms == pytest.approx(np.linalg.norm(placed - known.CENTRE))
 
 

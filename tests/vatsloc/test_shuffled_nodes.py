@@ -21,7 +21,7 @@ from tests.vatsloc import ball_scene as scene
 from vatsloc.formats.meshes import TetraMesh, read_vtu, write_vtu
 from vatsloc.imaging.surface import Border, SurfacePoints
 from vatsloc.maps import MeshMap, covered, sampled
-from vatsloc.workflow.ladder import misfit
+from vatsloc.workflow.model_selection import misfit
 from vatsloc.workflow.observe import held_nodes
 from vatsloc.workflow.residual import _border_offsets
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-import vatsloc.study.batched_contact
+import vatsloc.study.bench.batched_contact
 from poro.arrays import Array
 from poro.collapse import PoroStatus, Theta, assemble, solve
 from poro.contact import ChestWall, Compliance, ContactState, ContactStatus, level_set, solve_contact
@@ -21,8 +21,8 @@ from poro.fem import Tissue, solid
 from poro.fem.forms import body_load
 from poro.fem.tissue import GRAVITY_KPA_PER_MM
 from tests.poro.shapes import compliance_of, ellipsoid
-from vatsloc.study.batched_contact import CachedKktFactor, across, apply_many, solve_contact_batch
-from vatsloc.study.sweep import interpolated_guesses, solve_many
+from vatsloc.study.bench.batched_contact import CachedKktFactor, across, apply_many, solve_contact_batch
+from vatsloc.study.bench.sweep import interpolated_guesses, solve_many
 
 Hollow = tuple[Compliance, ChestWall, Array, list[float]]
 
@@ -85,8 +85,8 @@ def test_each_load_tells_how_it_ended_and_the_slow_ones_go_on_alone(
         handed.append(args[3])  # type: ignore[arg-type]
         return solve_contact(*args, max_steps=1 if len(handed) == 1 else 30)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(vatsloc.study.batched_contact, "QUICK_STEPS", 2)
-    monkeypatch.setattr(vatsloc.study.batched_contact, "solve_contact", pivoting)
+    monkeypatch.setattr(vatsloc.study.bench.batched_contact, "QUICK_STEPS", 2)
+    monkeypatch.setattr(vatsloc.study.bench.batched_contact, "solve_contact", pivoting)
     states = solve_contact_batch(compliance, wall, free, travel, starts)
     assert handed == travel[1:]
     assert [state.status for state in states[:2]] == [ContactStatus.CONVERGED, ContactStatus.STOPPED]

@@ -22,12 +22,11 @@ from registration.maps.rigid import RigidTransform
 from registration.volume import Mask, Volume
 from tests.vatsloc.browser import CHROMIUM, asked_by_the_page, visit
 from vatsloc.errors import CaseError, InputRefused
-from vatsloc.study import chart
-from vatsloc.study.affine import affine_to_points
-from vatsloc.study.chart import Row, append_row, measure_case, read_rows, run_chart
-from vatsloc.study.chart_draw import interactive, page, require_matplotlib, write_chart
-from vatsloc.study.chart_points import dominating, points_of, told_of_presets
-from vatsloc.study.chart_variants import VARIANTS, chosen_variants, masked_only, plain
+from vatsloc.study.bench.affine import affine_to_points
+from vatsloc.study.chart.chart import Row, append_row, chart, measure_case, read_rows, run_chart
+from vatsloc.study.chart.draw import interactive, page, require_matplotlib, write_chart
+from vatsloc.study.chart.points import dominating, points_of, told_of_presets
+from vatsloc.study.chart.variants import VARIANTS, chosen_variants, masked_only, plain
 from vatsloc.workflow.stages import Stages
 
 
@@ -258,7 +257,7 @@ def test_the_chart_s_files_hold_its_numbers(tmp_path: Path) -> None:
 
 def test_without_matplotlib_nothing_is_run(monkeypatch: pytest.MonkeyPatch) -> None:
     require_matplotlib()
-    monkeypatch.setattr("vatsloc.study.chart_draw.find_spec", lambda _name: None)
+    monkeypatch.setattr("vatsloc.study.chart.draw.find_spec", lambda _name: None)
     with pytest.raises(CaseError, match="matplotlib is not installed"):
         require_matplotlib()
 

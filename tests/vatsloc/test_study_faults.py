@@ -10,7 +10,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from registration.verification import LeftOver
-from vatsloc.study.stability_faults import FAULTS, LOBE_MM, LOBE_SHARE, beside_truth, page, score
+from vatsloc.study.stability.faults import FAULTS, LOBE_MM, LOBE_SHARE, beside_truth, page, score
 from vatsloc.workflow.check import Checks
 from vatsloc.workflow.gates import at_most
 

@@ -16,7 +16,7 @@ from poro.fit import Target
 from poro.fit.identifiability import THETA_NAMES
 from poro.mesh import stuff_level_set
 from vatsloc.imaging.surface import Border, SurfacePoints
-from vatsloc.study.stability_fit import DISTURBANCES, identifiability, page, random_starts
+from vatsloc.study.stability.fit import DISTURBANCES, identifiability, page, random_starts
 from vatsloc.workflow.observe import Observed
 from vatsloc.workflow.settings import Settings
 
@@ -70,7 +70,7 @@ def _scene() -> Any:
 
 
 def test_disturbances_do_what_they_are_called(monkeypatch: pytest.MonkeyPatch) -> None:
-    from vatsloc.study.stability_fit import Scene
+    from vatsloc.study.stability.fit import Scene
 
     surface, observed = _scene()
     nothing: Any = None
@@ -95,7 +95,7 @@ def test_the_picture_shows_every_run_that_answered(tmp_path: Path, monkeypatch: 
     pytest.importorskip("matplotlib")
     from matplotlib.axes import Axes
 
-    from vatsloc.study.stability_fit_draw import draw_disturbed
+    from vatsloc.study.stability.fit_draw import draw_disturbed
 
     drawn: list[tuple[list[float], str]] = []
     plain = Axes.scatter
@@ -117,7 +117,7 @@ def test_the_picture_shows_every_run_that_answered(tmp_path: Path, monkeypatch: 
 
 def test_a_case_without_landmarks_is_refused(tmp_path: Path) -> None:
     from vatsloc.errors import CaseError
-    from vatsloc.study.stability_fit import stability_fit
+    from vatsloc.study.stability.fit import stability_fit
 
     with pytest.raises(CaseError):
         stability_fit([tmp_path], tmp_path / "out", Settings())

@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 
 from vatsloc.cli import main
-from vatsloc.phantom_case import write_phantom
 from vatsloc.results import OUTPUT_FILES
+from vatsloc.synthetic.case import write_phantom
 
 NUMBERS = range(*(int(n) for n in os.environ.get("VATSLOC_MUTATIONS", "0:200").split(":")))
 IMAGES = ("ct", "cbct_inflated", "cbct_deflated")

@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from vatsloc.errors import InputRefused
-from vatsloc.study import paper
-from vatsloc.study.paper import CaseRuns, Run, read_runs, run_paper, settings_for
-from vatsloc.study.paper_draw import page
+from vatsloc.study.paper.draw import page
+from vatsloc.study.paper.paper import CaseRuns, Run, paper, read_runs, run_paper, settings_for
 
 
 def runs(case: str = "one") -> CaseRuns:

@@ -14,13 +14,13 @@ from scipy.sparse import csr_matrix
 from poro.fem import Tissue
 from poro.mesh import TetMesh
 from poro.mesh.tetmesh import dihedral_angles
-from vatsloc.study import bench_poro as bench
-from vatsloc.study import cost_poro as cost
-from vatsloc.study import stability_poro as stability
-from vatsloc.study import stability_poro_mesh as stability_mesh
-from vatsloc.study.getfem_peer import getfem_python
-from vatsloc.study.poro_lung import HILUM_CENTRE, RADII_MM, lung, smooth_wall, system_of, wall_level
-from vatsloc.study.stability_poro_mesh import with_slivers
+from vatsloc.study.bench import cost_poro as cost
+from vatsloc.study.bench import poro as bench
+from vatsloc.study.bench.getfem_peer import getfem_python
+from vatsloc.study.bench.poro_lung import HILUM_CENTRE, RADII_MM, lung, smooth_wall, system_of, wall_level
+from vatsloc.study.stability import poro as stability
+from vatsloc.study.stability import poro_mesh as stability_mesh
+from vatsloc.study.stability.poro_mesh import with_slivers
 from vatsloc.study.tables import Row, markdown
 
 

@@ -12,13 +12,13 @@ from registration.images.interpolate import interpolate
 from registration.maps.field import DisplacementField
 from registration.maps.rigid import RigidTransform
 from registration.volume import Mask, Volume
-from vatsloc.study import bench_registration as bench
-from vatsloc.study import stability_registration as stability
-from vatsloc.study.bench_registration import Ours, bench_registration, case_folder, page, score, table
-from vatsloc.study.cost_registration import Images, exponent
-from vatsloc.study.elastix import ElastixSettings, elastix_version, run_elastix
-from vatsloc.study.isolated import isolated
-from vatsloc.study.stability_registration import Scene, make_pair
+from vatsloc.study.bench import registration as bench
+from vatsloc.study.bench.cost_registration import Images, exponent
+from vatsloc.study.bench.elastix import ElastixSettings, elastix_version, run_elastix
+from vatsloc.study.bench.isolated import isolated
+from vatsloc.study.bench.registration import Ours, bench_registration, case_folder, page, score, table
+from vatsloc.study.stability import registration as stability
+from vatsloc.study.stability.registration import Scene, make_pair
 from vatsloc.workflow.stages import quiet
 
 AGREED = {"tre_mean", "tre_p95", "tre_max", "seconds", "peak_mb", "min_det", "folded_share"}

@@ -98,8 +98,10 @@ def test_points_and_normals_are_those_of_the_ball(scene: tuple[Pneumothorax, Sur
 def test_an_edge_that_no_image_shows_counts_half(scene: tuple[Pneumothorax, SurfacePoints]) -> None:
     found, _ = scene
     flat = Volume(np.full_like(found.image.hu, -700.0), found.image.ras_from_ijk)
-    blind = Pneumothorax(found.air, found.lung, found.space, flat, LIMIT_HU, CONTRAST_HU, 50.0, 90.0, found.airways)
-    surface = deflated_surface(blind, cbct(flat).field)
+    training_only = Pneumothorax(
+        found.air, found.lung, found.space, flat, LIMIT_HU, CONTRAST_HU, 50.0, 90.0, found.airways
+    )
+    surface = deflated_surface(training_only, cbct(flat).field)
     assert set(surface.border) == {Border.AIR, Border.FISSURE, Border.CONTACT}
     expected = np.where(surface.border == Border.CONTACT, 0.15, 0.5)
     assert_allclose(surface.confidence, expected)

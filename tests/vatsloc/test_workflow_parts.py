@@ -14,8 +14,8 @@ from registration.volume import Grid, Mask
 from vatsloc.errors import CaseError, InputRefused, NotConverged
 from vatsloc.maps import MeshMap, covered, sampled
 from vatsloc.workflow.gates import at_least, at_most
-from vatsloc.workflow.localize import in_view
 from vatsloc.workflow.observe import hand_placed
+from vatsloc.workflow.quality import in_view
 from vatsloc.workflow.settings import load_settings
 from vatsloc.workflow.stages import Stages
 

@@ -20,12 +20,12 @@ from pydantic import (
 
 from vatsloc.errors import CaseError
 from vatsloc.formats.guard import reading
+from vatsloc.frames import Side
 
 FILE_NAME = "case.toml"
 GRAVITY_LENGTH_TOLERANCE = 0.05
 """How far from 1 the length of gravity may be; components rounded to one digit stay within it."""
 
-Side = Literal["right", "left"]
 PleuralGas = Literal["air", "co2"]
 Coordinate = Annotated[float, Field(allow_inf_nan=False, strict=True)]
 Slope = Annotated[float, Field(allow_inf_nan=False, strict=True, gt=0)]

@@ -13,7 +13,6 @@ from pathlib import Path
 
 import meshio
 import numpy as np
-import trimesh
 
 from registration.volume import Array
 from vatsloc.errors import CaseError, InputRefused
@@ -100,13 +99,11 @@ def read_surface(path: Path) -> Surface:
         return Surface(read_points(path).ras, np.empty((0, 3), dtype=int))
     if suffix != ".stl":
         raise CaseError(f"{path} is no surface file; give an .stl, or points in a .mrk.json.")
-    mesh = trimesh.load_mesh(path, file_type="stl", process=False)  # which would drop corners that are not finite
-    if not np.isfinite(mesh.vertices).all():
-        raise InputRefused(f"{path} holds corners that are not finite; export it again.")
-    mesh.merge_vertices()
-    points, triangles = np.asarray(mesh.vertices, dtype=float), np.asarray(mesh.faces, dtype=int)
-    if len(triangles) == 0:
-        raise InputRefused(f"{path} holds no triangles; export it again.")
+    with np.errstate(over="ignore"):  # meshio takes bytes of a text file for a count and multiplies it
+        mesh = meshio.stl.read(path)  # a corner that triangles share is one point
+    points, triangles = np.asarray(mesh.points, dtype=float), np.asarray(mesh.cells[0].data, dtype=int)
+    if len(triangles) == 0 or not np.isfinite(points).all():
+        raise InputRefused(f"{path} holds no triangles, or corners that are not finite; export it again.")
     stated = re.search(rb"SPACE\s*=\s*(RAS|LPS)", path.read_bytes()[:300])
     if stated is None or stated.group(1) == b"LPS":
         points = flip_points(points)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from scipy import ndimage
@@ -11,10 +10,9 @@ from scipy import ndimage
 from registration.images.morphology import close, dilate, erode, largest
 from registration.volume import Array, Grid, Mask, Volume
 from vatsloc.errors import InputRefused
+from vatsloc.frames import Side
 from vatsloc.imaging.airways import grow_airways, trachea
 from vatsloc.imaging.lattice import on_grid, working_copy
-
-Side = Literal["left", "right"]
 
 AIRY_HU = -400.0
 ROOM_AIR_HU = -930.0

@@ -19,8 +19,8 @@ from vatsloc.report.data import LUNG, MESH, NODULE, SURFACE, Comparison, Picture
 from vatsloc.report.landmarks import moved_by
 from vatsloc.report.paint import as_bgr, draw_nodule, draw_outline, green_magenta, grey, jpeg
 from vatsloc.report.planes import AXES, EDGE_LETTERS, Plane, box_of, plane_through, sample
-from vatsloc.report.scene import scene
 from vatsloc.report.stack import stacks
+from vatsloc.report.view3d import scene
 
 STILL_PIXELS = 480
 

@@ -35,8 +35,8 @@ def bench_poro_command(
     as_json: JsonOption = False,
 ) -> None:
     """Poroelastic lung: displacements and speed beside GetFEM's, and cost against mesh size."""
-    from vatsloc.study.bench_poro import bench_poro, page, table
-    from vatsloc.study.cost_poro import SIZES
+    from vatsloc.study.bench.cost_poro import SIZES
+    from vatsloc.study.bench.poro import bench_poro, page, table
 
     result = bench_poro(tuple(size for size in SIZES if cost and size <= max_tets), say=say)
     _report(result, table, page, out, as_json)
@@ -52,7 +52,7 @@ def bench_registration_command(
     as_json: JsonOption = False,
 ) -> None:
     """Phase 1: errors at the landmarks, seconds, memory and folding beside itk-elastix, and cost against image size."""
-    from vatsloc.study.bench_registration import bench_registration, page, table
+    from vatsloc.study.bench.registration import bench_registration, page, table
 
     result = bench_registration(cases or [], say=say)
     _report(result, table, page, out, as_json)
@@ -73,7 +73,7 @@ def bench_fit_command(
     as_json: JsonOption = False,
 ) -> None:
     """The whole chain: errors, seconds, how often the ellipsoid holds the nodule, and the share of silent failures."""
-    from vatsloc.study.bench_fit import bench_fit, table
+    from vatsloc.study.bench.fit import bench_fit, table
 
     result = bench_fit(cases or [], out, jobs, say=say)
     say(table(result))
@@ -88,7 +88,7 @@ def bench_cbct_command(
     as_json: JsonOption = False,
 ) -> None:
     """The phantoms' cone-beam scanner in the image domain beside a C-arm's projections (extra "projections")."""
-    from vatsloc.study.bench_cbct import bench_cbct, table
+    from vatsloc.study.bench.cbct import bench_cbct, table
 
     result = bench_cbct(name, seed, say)
     say(table(result))
@@ -106,9 +106,9 @@ def bench_real_command(
     as_json: JsonOption = False,
 ) -> None:
     """Real lungs: move one breath-hold into the other by shape alone; errors at landmarks that were only scored."""
-    from vatsloc.study.bench_real import bench_real, table
-    from vatsloc.study.chart_draw import require_matplotlib
-    from vatsloc.study.real_draw import draw_real
+    from vatsloc.study.bench.real import bench_real, table
+    from vatsloc.study.bench.real_draw import draw_real
+    from vatsloc.study.chart.draw import require_matplotlib
 
     if picture is not None:
         require_matplotlib()
@@ -125,7 +125,7 @@ def stability_poro_command(
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for CSV files, plots and tables.md.")],
 ) -> None:
     """Poroelastic lung: pressure bounds, inverted elements, nu towards 0.5, contact methods, small hila."""
-    from vatsloc.study.stability_poro import stability_poro
+    from vatsloc.study.stability.poro import stability_poro
 
     stability_poro(out, say)
     print(out / "tables.md")
@@ -136,7 +136,7 @@ def stability_registration_command(
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for CSV files, the plot and tables.md.")],
 ) -> None:
     """Registration: noise, view, start, motion, collapsed lung, and the spine's pose; goes on where it was stopped."""
-    from vatsloc.study.stability_registration import stability_registration
+    from vatsloc.study.stability.registration import stability_registration
 
     stability_registration(out, say)
     print(out / "tables.md")
@@ -148,7 +148,7 @@ def stability_fit_command(
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for CSV files and tables.md.")],
 ) -> None:
     """Collapse: disturbed surface, gravity, hilum and spine; random starts; what the surface tells of theta."""
-    from vatsloc.study.stability_fit import stability_fit
+    from vatsloc.study.stability.fit import stability_fit
     from vatsloc.workflow.settings import Settings
 
     stability_fit(cases, out, Settings(), say)
@@ -162,7 +162,7 @@ def stability_faults_command(
     preset: Annotated[str, typer.Option(help="Preset of the runs.")] = "balanced",
 ) -> None:
     """Whole run: shifts, turns, a slipped vertebra, swapped and strange scans put in; whether the run notices."""
-    from vatsloc.study.stability_faults import stability_faults
+    from vatsloc.study.stability.faults import stability_faults
     from vatsloc.workflow.settings import load_settings
 
     stability_faults(cases, out, load_settings(preset, None), say)
@@ -175,6 +175,6 @@ def stability_choices_command(
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for choices.md.")],
 ) -> None:
     """Preset auto: how far the nodule moves when a choice is made the other way."""
-    from vatsloc.study.choices import study_choices, table
+    from vatsloc.study.stability.choices import study_choices, table
 
     print(table(study_choices(cases, out, say=say)))

@@ -1,8 +1,8 @@
-"""A run's check of itself: the CT, carried through the answer, beside the scan that it should look like.
+"""A run's check of itself: the CT, warped by the result, compared with the scan that it should look like.
 
-The eyes that compare took no part in the answer (registration/verification.py), so a fault anywhere between the first
-registration and the last shows here: as a shift or turn of the whole, as a part that is off, or as a lung in which
-nothing is recognized.
+The comparison uses nothing that led to the result (registration/verification.py), so a fault anywhere between the first
+registration and the last shows here: as a shift or rotation of the whole, as a part that is off, or as a lung in which
+no keypoint is recognized.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from registration.volume import Array, Mask, Volume
 from vatsloc.frames import flip_points
 from vatsloc.imaging.cbct import PreparedCbct
 from vatsloc.maps import MeshMap, covered, sampled
-from vatsloc.workflow.certainty import CHECK_REACH_MM
 from vatsloc.workflow.gates import Gate, at_least, at_most
 from vatsloc.workflow.settings import GateSettings
+from vatsloc.workflow.uncertainty import CHECK_REACH_MM
 
 VOXEL_MM, MAP_MM = 2.0, 4.0
 RIM_MM = 3.0
@@ -32,7 +32,7 @@ MARGIN_MM = 40.0
 
 @dataclass(frozen=True)
 class Checks:
-    """What is left over of both parts of an answer. phase1: CT to inflated CBCT; chain: CT to deflated CBCT."""
+    """What is left over of both parts of a result. phase1: CT to inflated CBCT; chain: CT to deflated CBCT."""
 
     phase1: LeftOver
     chain: LeftOver

@@ -1,4 +1,4 @@
-"""What a run leaves out after a look at the scene: for every part one measured value against one limit."""
+"""Parts of a run that a scene may not need: each is left out by one measured value against one limit."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from registration.volume import Array
 from vatsloc.case import Case
 from vatsloc.maps import MeshMap
 from vatsloc.workflow.choices import weigh
-from vatsloc.workflow.ladder import Model, climb
+from vatsloc.workflow.model_selection import CollapseModel, select_model
 from vatsloc.workflow.observe import Observed, observe
 from vatsloc.workflow.pose import ChangeOfPose
 from vatsloc.workflow.prepare import Prepared
@@ -34,7 +34,7 @@ class Collapse:
     """
 
     observed: Observed
-    model: Model
+    model: CollapseModel
     residual: Residual | None
     points_after: Array
 
@@ -83,18 +83,18 @@ def collapse(
     case: Case, prepared: Prepared, pose: ChangeOfPose, observed: Observed, settings: Settings, stages: Stages
 ) -> Collapse:
     """The part of `pneumothorax` that follows the observations."""
-    model = climb(case.gravity_ras, prepared, observed, settings, stages)
+    model = select_model(case.gravity_ras, prepared, observed, settings, stages)
     before = observed.mesh_before
     after = before.points + interpolate(locate(observed.model_mesh, before.points), model.displacement)
     if not settings.residual.on:
         stages.skip(RESIDUAL, "switched off in the settings")
         return Collapse(observed, model, None, after)
-    misfit_mm = np.inf if model.held_back_mm is None else model.held_back_mm
-    seen = f"the model misses places that it has not seen by {misfit_mm:.2f} mm (median)"
+    misfit_mm = np.inf if model.held_out_mm is None else model.held_out_mm
+    seen = f"the model misses held-out keypoints by {misfit_mm:.2f} mm (median)"
     if not stages.choose(weigh(RESIDUAL, misfit_mm, settings.leave_out.residual_mm, seen)):
         return Collapse(observed, model, None, after)
     rigid, chosen = observed.def_from_inf_rigid, settings.residual
-    if any(rung.kept for rung in model.rungs):
+    if any(refinement.kept for refinement in model.refinements):
         chosen = chosen.model_copy(update={"levels": max(chosen.levels - 1, 1)})
     with stages.stage(RESIDUAL):
         residual = residual_registration(
@@ -104,7 +104,7 @@ def collapse(
             before,
             observed.surface,
             chosen,
-            model.pairs.mapped(moving=rigid.inverse()),
+            model.correspondences.mapped(moving=rigid.inverse()),
         )
     return Collapse(observed, model, residual, after if residual is None else after + residual.displacement)
 

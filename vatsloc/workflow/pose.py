@@ -142,10 +142,10 @@ def change_of_pose(
 
 
 def moved_far(fit: SlidingFit, limit_mm: float) -> Choice:
-    """Whether places inside the lung moved so far that the coarse levels were needed."""
-    moved, seen = fit.moved_mm, "too few places inside the lung were found about the spine's pose"
+    """Whether keypoints inside the lung moved so far that the coarse levels were needed."""
+    moved, seen = fit.moved_mm, "too few keypoints were matched inside the lung about the spine's pose"
     if fit.matched:
-        seen = f"95 % of {fit.matched} places inside the lung moved by at most {moved:.1f} mm against the spine"
+        seen = f"95 % of {fit.matched} keypoints inside the lung moved by at most {moved:.1f} mm against the spine"
     return weigh(FIRST, moved, limit_mm, seen)
 
 

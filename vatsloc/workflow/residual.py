@@ -1,7 +1,7 @@
-"""What images say beyond the model: a registration of the modelled lung to the observed one, where both scans see it.
+"""Residual registration: the modelled lung registered to the observed one, where both scans show it.
 
-The model brings tissue near enough for vessels to find themselves; alone, the same registration runs away on a
-collapsed lung. Two registrations, there and back, tell where the answer can be believed, and the lung carries it on.
+The model brings vessels near enough to be matched; without it the same registration diverges on a collapsed lung. A
+node is moved where two registrations, forward and backward, agree on its position; all others follow elastically.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from vatsloc.imaging.surface import Border, SurfacePoints
 from vatsloc.maps import MeshMap
 from vatsloc.workflow.prepare import Prepared
 from vatsloc.workflow.settings import ResidualSettings
-from vatsloc.workflow.view import view_of
+from vatsloc.workflow.warped_pair import warped_pair
 
 BORDER_MM = 2.0
 NEAR_REGION_MM = 4.0
@@ -49,7 +49,7 @@ class Residual:
 
     @property
     def agreed_share(self) -> float:
-        """Share of the compared nodes that both registrations put at the same place."""
+        """Share of the compared nodes on whose position both registrations agree."""
         return float(self.seen.sum() / max(self.compared.sum(), 1))
 
     @property
@@ -65,19 +65,18 @@ def residual_registration(
     mesh_before: TetMesh,
     surface: SurfacePoints,
     settings: ResidualSettings,
-    pairs: Correspondences,
+    keypoints: Correspondences,
 ) -> Residual | None:
     """Displacements that take the modelled nodes to where the images show their tissue; None where too little is seen.
 
     lung_def: the collapsed lung as it was segmented; def_from_inf: the model's map; mesh_before: its undeformed mesh in
-    the deflated CBCT's frame; surface: observed points, which place the border where the images inside do not; pairs:
-    places found again inside the lung, in the frames of the inflated and the deflated CBCT, which hold both
-    registrations where they show.
+    the deflated CBCT's frame; surface: observed points, which move the border where the images inside do not;
+    keypoints: correspondences in the frames of the inflated and the deflated CBCT, a term of both registrations.
     """
     nodes = def_from_inf.moved
     modelled = TetMesh(nodes, def_from_inf.mesh.tets)
-    view = view_of(prepared, lung_def, def_from_inf, settings.voxel_mm)
-    observed, expected = _inner(view.lung), _inner(view.modelled)
+    scans = warped_pair(prepared, lung_def, def_from_inf, settings.voxel_mm)
+    observed, expected = _inner(scans.lung), _inner(scans.modelled)
     if not (observed.inside.any() and expected.inside.any()):
         return None
     ffd = FfdSettings(
@@ -86,11 +85,11 @@ def residual_registration(
         voxel_mm=settings.voxel_mm,
         weights=Weights(bending=settings.bending, keypoints=settings.keypoints),
     )
-    expected_at = pairs.mapped(moving=def_from_inf)
-    forth, homeward = (expected_at, expected_at.swapped()) if len(pairs) else (None, None)
-    register = partial(register_ffd, settings=ffd, moving_mask=view.both_see)
-    there = register(view.deflated, view.warped, fixed_mask=observed, matches=forth)
-    back = register(view.warped, view.deflated, fixed_mask=expected, matches=homeward)
+    expected_at = keypoints.mapped(moving=def_from_inf)
+    forth, homeward = (expected_at, expected_at.swapped()) if len(keypoints) else (None, None)
+    register = partial(register_ffd, settings=ffd, moving_mask=scans.both_see)
+    there = register(scans.deflated, scans.warped, fixed_mask=observed, matches=forth)
+    back = register(scans.warped, scans.deflated, fixed_mask=expected, matches=homeward)
     inverse = invert_at(there.moving_from_fixed, nodes, nodes)
     placed, other = inverse.points_fixed, back.moving_from_fixed(nodes)
     disagreement = np.linalg.norm(placed - other, axis=1)

@@ -23,14 +23,16 @@ from vatsloc.report.collect import report_data
 from vatsloc.report.data import LUNG, SURFACE, Outline, Picture
 from vatsloc.report.render import write_report
 from vatsloc.results import OUTPUT_FILES, RADIUS95, REPORT, ResultData, RunRecord, write_results
-from vatsloc.scene import write_result_scenes
-from vatsloc.workflow.certainty import radius95, scatter
-from vatsloc.workflow.localize import Localization, localize, surface_distances
+from vatsloc.slicer_scene import write_result_scenes
+from vatsloc.workflow.localization import Localization
+from vatsloc.workflow.localize import localize
 from vatsloc.workflow.pneumothorax import contact_surface
 from vatsloc.workflow.pose import ChangeOfPose
+from vatsloc.workflow.quality import surface_distances
 from vatsloc.workflow.residual import Residual
 from vatsloc.workflow.settings import Settings
 from vatsloc.workflow.stages import Say, Stages, quiet
+from vatsloc.workflow.uncertainty import radius95, scatter
 
 FIELD_MARGIN_MM = 10.0
 BALL_MM = 5.0
@@ -122,7 +124,7 @@ def _tetra(mesh: TetMesh, displacement: Array, pressure: Array, det_f: Array, co
 
 
 def _with_radius95(found: Localization, lung: TetraMesh) -> TetraMesh:
-    """With how sure the run is of each node."""
+    """With the 95 % radius of each node's position."""
     radius = radius95(found.pose, found.collapse, None if found.checks is None else found.checks.chain)
     return replace(lung, point_data={**lung.point_data, RADIUS95: radius})
 
@@ -199,7 +201,7 @@ def _record(case: Case, found: Localization, settings: Settings, stages: Stages)
 
 
 def _residuals(found: Localization) -> dict[str, Any]:
-    """What each solver left over, with its own word on how it ended."""
+    """Residuals of each solver, with the status that it reports."""
     pose, collapse = found.pose, found.collapse
     state, motion = collapse.fit.state, collapse.observed.motion
     return {
@@ -218,9 +220,9 @@ def _residuals(found: Localization) -> dict[str, Any]:
             "identifiability": collapse.identifiability.entry(),
             "volume_ratio": collapse.mesh_after.volumes.sum() / collapse.mesh_before.volumes.sum(),
         },
-        "keypoints": {"found": len(collapse.model.pairs), "held_back_mm": collapse.model.held_back_mm},
-        "other_answers": {"number": len(collapse.model.others), "rms_mm_at_nodule": _scatter_mm(found)},
-        "ladder": [asdict(rung) for rung in collapse.model.rungs],
+        "keypoints": {"found": len(collapse.model.correspondences), "held_out_mm": collapse.model.held_out_mm},
+        "perturbation_ensemble": {"number": len(collapse.model.ensemble), "rms_mm_at_nodule": _scatter_mm(found)},
+        "model_selection": [asdict(refinement) for refinement in collapse.model.refinements],
         "residual_registration": _corrected(collapse.residual),
         "surface_mm": {f"p{share}": np.percentile(surface_distances(collapse), share) for share in (50, 75, 90, 95)},
         "mesh": {"tetrahedra": len(pose.mesh_ct.tets), "model_tetrahedra": len(collapse.system.mesh.tets)},
@@ -228,7 +230,7 @@ def _residuals(found: Localization) -> dict[str, Any]:
 
 
 def _scatter_mm(found: Localization) -> float:
-    """Root mean square distance in mm between the nodule's place and those of other answers."""
+    """Root mean square distance in mm of the nodule in the ensemble from where the result puts it."""
     point = found.collapse.def_from_inf_rigid(found.nodule_inf[None])
     return float(np.sqrt(np.trace(scatter(found.collapse, point)[0])))
 

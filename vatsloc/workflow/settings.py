@@ -40,8 +40,8 @@ class MeshSettings(_Table):
 
 
 class ModelSettings(_Table):
-    """Phase 2. cost: "plain" is the paper's; hilum, diaphragm: its variants leave one out; regional, correct: rungs
-    beyond the paper, tried where keypoints can say whether they help.
+    """Phase 2. cost: "plain" is the paper's; hilum, diaphragm: its variants leave one out; regional, correct:
+    refinements beyond the paper, kept where they predict held-out keypoints better.
     """
 
     cost: Literal["surface", "plain"] = "surface"
@@ -54,9 +54,9 @@ class ModelSettings(_Table):
 
 
 class KeypointSettings(_Table):
-    """Places inside the lung, found again between the cone-beam CTs. Lengths in mm; reach_mm: how far off along each
-    axis the model may be; sigma_mm: standard deviation of one in the fit, three quarters of it in the elastic
-    correction.
+    """Keypoints inside the lung, matched between the cone-beam CTs. Lengths in mm; reach_mm: how far off along each
+    axis the model may be; sigma_mm: standard deviation of a correspondence in the fit, three quarters of it in the
+    elastic correction.
     """
 
     on: bool = True
@@ -82,8 +82,8 @@ class ResidualSettings(_Table):
 class LeaveOutSettings(_Table):
     """Up to which value, measured on the scene, a part is left out.
 
-    first_registration_mm: how far 95 % of the places inside the lung moved against the spine; residual_mm: median
-    misfit of the model at places that it has not seen; strained_share: of elements beyond the range of linear strain
+    first_registration_mm: how far 95 % of the keypoints inside the lung moved against the spine; residual_mm: median
+    misfit of the model at held-out keypoints; strained_share: of elements beyond the range of linear strain
     (finite strain). -1 keeps a part whatever is seen.
     """
 
@@ -106,7 +106,7 @@ class GateSettings(_Table):
     max_fissure_share: float = 0.1
     min_agreement: float = 0.5
     max_model_error_mm: float = 10.0
-    max_held_back_mm: float = 5.0
+    max_held_out_mm: float = 5.0
     max_ellipsoid_mm: float = 15.0
     max_out_of_view_mm: float = 10.0
     max_left_over_mm: float = 4.0

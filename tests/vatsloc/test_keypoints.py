@@ -1,0 +1,137 @@
+"""Keypoints inside the lung in the right frames, and both cone-beam CTs on one grid."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from registration.correspondences import Correspondences
+from registration.volume import Array
+from tests.vatsloc import ball_scene as scene
+from vatsloc.maps import MeshMap
+from vatsloc.workflow import keypoints as module
+from vatsloc.workflow.keypoints import find_correspondences
+from vatsloc.workflow.settings import KeypointSettings
+from vatsloc.workflow.warped_pair import warped_pair
+
+INFLATED = scene.placed(scene.lung_mesh(), scene.INF_FROM_CT)
+BEFORE = scene.placed(scene.lung_mesh(), scene.INF_FROM_CT, scene.DEF_FROM_INF)
+TRUTH = scene.collapsed(BEFORE.points)
+PLANE_INF, PLANE_DEF = scene.CENTRE_INF[0] + 20.0, scene.CENTRE_DEF[2] + 18.0
+
+
+@pytest.fixture
+def observed() -> Any:
+    """The model's mesh is another one than the lung's."""
+    coarse = scene.placed(scene.lung_mesh(14.0), scene.INF_FROM_CT, scene.DEF_FROM_INF)
+    return SimpleNamespace(
+        model_mesh=coarse, mesh_before=BEFORE, def_from_inf_rigid=scene.DEF_FROM_INF, found=scene.pneumothorax()
+    )
+
+
+def half_seen() -> Any:
+    """Each scan sees the lung up to a plane of its own."""
+    return scene.prepared(
+        scene.inflated().grid.points()[..., 0] < PLANE_INF, scene.deflated().grid.points()[..., 2] < PLANE_DEF
+    )
+
+
+def depth_before(points: Array) -> Array:
+    return scene.RADIUS_MM - np.linalg.norm(points - scene.CENTRE_DEF, axis=1)
+
+
+def test_keypoints_lie_where_the_spine_puts_them_before_the_collapse_and_where_they_went_after_it(
+    observed: Any,
+) -> None:
+    model = 0.6 * (scene.collapsed(observed.model_mesh.points) - observed.model_mesh.points)
+    found = find_correspondences(half_seen(), observed, model, KeypointSettings(reach_mm=8.0))
+    assert len(found) > 70
+    error = np.linalg.norm(scene.collapsed(found.moving) - found.fixed, axis=1)
+    assert np.median(error) < 0.8
+    assert np.percentile(error, 95) < 2.0
+    assert depth_before(found.moving).min() > 0
+    assert scene.DEF_FROM_INF.inverse()(found.moving)[:, 0].max() < PLANE_INF + 2.5
+    assert found.fixed[:, 2].max() < PLANE_DEF + 2.5
+
+
+def test_propagation_gets_both_images_in_one_frame_and_the_lung_of_each(
+    observed: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    warped = scene.CENTRE_DEF + np.random.default_rng(1).uniform(-18, 18, (30, 3))
+    deflated = warped + np.array([1.0, 2.0, 3.0])
+    model = 0.6 * (scene.collapsed(observed.model_mesh.points) - observed.model_mesh.points)
+    matched: dict[str, Any] = {}
+    propagated: dict[str, Any] = {}
+
+    def match(fixed: Any, moving: Any, fixed_region: Any, settings: Any, moving_region: Any) -> Correspondences:
+        matched.update(fixed=fixed, moving=moving, settings=settings)
+        matched.update(fixed_region=fixed_region, moving_region=moving_region)
+        return Correspondences.of(deflated, warped, ncc=np.linspace(0.7, 0.9, 30))
+
+    def propagate(
+        fixed: Any, moving: Any, fixed_region: Any, moving_region: Any, seeds: Correspondences, settings: Any
+    ) -> Correspondences:
+        propagated.update(fixed=fixed, moving=moving, after=fixed_region, before=moving_region, settings=settings)
+        return seeds
+
+    monkeypatch.setattr(module, "match_keypoints", match)
+    monkeypatch.setattr(module, "propagate_matches", propagate)
+    found = find_correspondences(half_seen(), observed, model, KeypointSettings(voxel_mm=2.0, reach_mm=9.0))
+    # The model takes 60 % of an affine collapse: its inverse is affine too.
+    gradient = np.eye(3) + 0.6 * (scene.SQUEEZE - np.eye(3))
+    before = scene.CENTRE_DEF + (warped - scene.CENTRE_DEF - 0.6 * scene.SHIFT_MM) @ np.linalg.inv(gradient).T
+    assert_allclose(found.moving, before, atol=1e-6)
+    assert_allclose(found.fixed, deflated)
+    assert_allclose(found.ncc, np.linspace(0.7, 0.9, 30))
+    assert matched["settings"].voxel_mm == 2.0
+    assert matched["settings"].reach_mm == 9.0
+    assert propagated["settings"].match == matched["settings"]
+    # Tissue in the region of the modelled and of the observed lung.
+    for region, expanded in (
+        (
+            matched["moving_region"],
+            lambda x: scene.CENTRE_DEF + (x - scene.CENTRE_DEF - 0.6 * scene.SHIFT_MM) @ np.linalg.inv(gradient).T,
+        ),
+        (matched["fixed_region"], scene.expanded),
+    ):
+        points = region.grid.points()[region.inside]
+        assert -2.0 < depth_before(expanded(points)).min() < 1.0
+    corner = propagated["moving"].grid.to_ras(np.zeros((1, 3)))
+    size = (np.array(scene.inflated().hu.shape) - 1.0) * scene.SPACING_MM / 2
+    assert_allclose(scene.DEF_FROM_INF.inverse()(corner)[0], scene.CENTRE_INF - size, atol=3.0)
+    assert_array_equal(propagated["fixed"].hu, scene.deflated().hu)
+    assert_array_equal(propagated["moving"].hu, scene.inflated().hu)
+    points = propagated["before"].grid.points()[propagated["before"].inside]
+    assert 1.0 < depth_before(points).min() < 4.0
+    assert PLANE_INF - 4.0 < scene.DEF_FROM_INF.inverse()(points)[:, 0].max() < PLANE_INF + 2.0
+    points = propagated["after"].grid.points()[propagated["after"].inside]
+    assert 1.0 < depth_before(scene.expanded(points)).min() < 4.0
+    assert PLANE_DEF - 4.0 < points[:, 2].max() < PLANE_DEF + 2.0
+    assert points[:, 2].min() < PLANE_DEF - 30.0
+
+
+def test_under_the_right_map_both_images_show_the_same(observed: Any) -> None:
+    scans = warped_pair(half_seen(), scene.lung_deflated(), MeshMap(INFLATED, TRUTH, scene.DEF_FROM_INF), 2.0)
+    assert np.corrcoef(scans.warped.hu[scans.lung.inside], scans.deflated.hu[scans.lung.inside])[0, 1] > 0.9
+    assert (scans.lung.inside == scans.modelled.inside).mean() > 0.985
+    points = scans.both_see.grid.points()
+    back = scene.DEF_FROM_INF.inverse()(scene.expanded(points[scans.lung.inside]))
+    assert back[:, 0].max() < PLANE_INF + 2.5
+    assert points[scans.lung.inside][:, 2].max() < PLANE_DEF + 1.1
+    assert_array_equal(scans.lung.inside & ~scans.both_see.inside, False)
+    assert_array_equal(scans.modelled.inside & ~scans.both_see.inside, False)
+    inner = np.random.default_rng(5).uniform(-15, 15, (20, 3)) + scene.CENTRE_DEF
+    assert_allclose(scans.inf_from_def(inner), scene.DEF_FROM_INF.inverse()(scene.expanded(inner)), atol=0.05)
+
+
+def test_the_modelled_lung_is_the_moved_mesh(observed: Any) -> None:
+    scans = warped_pair(
+        scene.prepared(), scene.lung_deflated(), MeshMap(INFLATED, BEFORE.points, scene.DEF_FROM_INF), 2.0
+    )
+    points = scans.modelled.grid.points()[scans.modelled.inside]
+    assert_allclose(points.mean(axis=0), scene.CENTRE_DEF, atol=0.3)
+    assert scans.modelled.inside.sum() * 8 == pytest.approx(BEFORE.volumes.sum(), rel=0.02)

@@ -1,0 +1,391 @@
+"""Model selection as a whole: what each step is shown, which model it starts from, and what is left out and why."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from poro.collapse import PoroStatus, Theta
+from poro.collapse import StrainMeasure as Strain
+from poro.collapse.choice import StrainChoice
+from poro.fem import Tissue
+from poro.fit import Fit, FitSettings, FitStatus, Target
+from poro.mesh import TetMesh
+from registration.correspondences import Correspondences
+from registration.volume import Array
+from tests.vatsloc import ball_scene as scene
+from vatsloc.imaging.surface import Border, SurfacePoints
+from vatsloc.workflow import model_selection as module
+from vatsloc.workflow.model_selection import (
+    GAIN,
+    NO_CORRESPONDENCES,
+    NO_ENSEMBLE,
+    CollapseModel,
+    Refinement,
+    _regional,
+    _too_few,
+    corrected,
+    fit_settings,
+    held_out,
+    select_model,
+    select_refinement,
+    surface_target,
+)
+from vatsloc.workflow.settings import settings_of
+from vatsloc.workflow.stages import Stages
+
+GRAVITY = np.array([1.0, 0.0, 0.0])
+HILUM = np.array([5, 3, 40, 17, 60])
+HILUM_MM = np.arange(15.0).reshape(5, 3)
+
+
+def mesh() -> TetMesh:
+    return scene.placed(scene.lung_mesh(14.0), scene.INF_FROM_CT, scene.DEF_FROM_INF)
+
+
+def motion(points: Array) -> Array:
+    return np.asarray(scene.collapsed(points) - points)
+
+
+def pairs_of(count: int = 400, seed: int = 5) -> Correspondences:
+    """Keypoints that move by the scene's collapse."""
+    x = scene.CENTRE_DEF + np.random.default_rng(seed).uniform(-19, 19, (count, 3))
+    # Far enough from each other that some blocks of 40 mm are held out and others are not.
+    return Correspondences.of(scene.collapsed(x), x)
+
+
+def a_fit(displacement: Array, settled: bool = True, tets: int = 1, inverted: float = 0.0) -> Any:
+    det = np.where(np.arange(tets) < inverted * tets, -1.0, 1.0)
+    state = SimpleNamespace(u=displacement, det_f=det, status=PoroStatus.SOLVED)
+    if not settled:
+        state.status = PoroStatus.NOT_CONVERGED
+    return _Fit(Theta(1e-7, 0.6, 3.0), state)
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """What model selection reads of a fit."""
+
+    theta: Theta
+    state: Any
+    status: FitStatus = FitStatus.CONVERGED
+
+
+def a_model(
+    share: float = 0.0, pairs: Correspondences | None = None, refinements: tuple[Refinement, ...] = ()
+) -> CollapseModel:
+    """A model that knows a share of the collapse."""
+    lung: Any = mesh()
+    system: Any = SimpleNamespace(mesh=lung, gravity=GRAVITY, hilum=HILUM, tissue=None)
+    u = share * motion(lung.points)
+    nothing: Any = None
+    return CollapseModel(system, a_fit(u), u, pairs_of() if pairs is None else pairs, refinements, nothing, NO_ENSEMBLE)
+
+
+def knows(share: float, **change: Any) -> Any:
+    """A step to a model that knows a share of the collapse."""
+
+    def step(model: CollapseModel, target: Target, start: Fit) -> CollapseModel:
+        return replace(model, displacement=share * motion(model.system.mesh.points), **change)
+
+    return step
+
+
+def a_surface() -> Target:
+    found = scene.air_surface(30)
+    return Target(found.points, found.normals, found.confidence)
+
+
+def test_held_out_keypoints_are_never_shown_to_the_model_that_is_judged_by_them() -> None:
+    shown: list[tuple[CollapseModel, Target, Any]] = []
+
+    def watched(model: CollapseModel, target: Target, start: Fit) -> CollapseModel:
+        shown.append((model, target, start))
+        return replace(
+            model, displacement=(0.7 + 0.1 * len(shown)) * motion(model.system.mesh.points), fit=a_fit(0 * u)
+        )
+
+    start = a_model(0.2)
+    u, surface = start.displacement, a_surface()
+    training_only = replace(start, displacement=0.5 * u, fit=a_fit(u))
+    model, trained = select_refinement({"step": watched}, start, training_only, surface)
+    hidden = held_out(start.correspondences.fixed)
+    assert 10 < hidden.sum() < len(hidden) - 10
+    (one, few, from_one), (other, every, from_other) = shown
+    assert (one, other) == (training_only, start)
+    assert_array_equal(few.inflated, start.correspondences.moving[~hidden])
+    assert_array_equal(few.deflated, start.correspondences.fixed[~hidden])
+    assert_array_equal(few.keypoint_weights, np.ones((~hidden).sum()))
+    assert_array_equal(every.inflated, start.correspondences.moving)
+    assert_array_equal(every.deflated, start.correspondences.fixed)
+    for target in (few, every):
+        assert_array_equal(target.points, surface.points)
+        assert_array_equal(target.normals, surface.normals)
+    assert from_one is training_only.fit
+    assert from_other is trained.fit
+    assert_allclose(trained.displacement, 0.8 * motion(start.system.mesh.points))
+    assert_allclose(model.displacement, 0.9 * motion(start.system.mesh.points))
+    (refinement,) = model.refinements
+    whole = np.linalg.norm(start.correspondences.fixed - start.correspondences.moving, axis=1)[hidden]
+    assert refinement.before_mm == pytest.approx(
+        0.9 * np.median(whole), rel=0.05
+    )  # the training_only model knows 0.1 of it
+    assert refinement.after_mm == pytest.approx(0.2 * np.median(whole), rel=0.05)
+    assert refinement.kept
+
+
+@pytest.mark.parametrize(("left", "kept"), [(GAIN + 0.01, False), (GAIN - 0.01, True)])
+def test_a_refinement_has_to_gain_five_percent(left: float, kept: bool) -> None:
+    start = a_model(0.0)
+    model, training_only = select_refinement({"step": knows(1 - left)}, start, start, a_surface())
+    (refinement,) = model.refinements
+    assert refinement.after_mm / refinement.before_mm == pytest.approx(left, abs=1e-3)
+    assert refinement.kept is kept
+    assert model.held_out_mm == (refinement.after_mm if kept else refinement.before_mm)
+    assert_array_equal(training_only.displacement, model.displacement)
+    assert bool(model.displacement.any()) is kept
+
+
+def test_the_best_is_taken_and_where_it_does_not_settle_the_next_best() -> None:
+    start = a_model(0.0)
+    loose = knows(0.9, fit=a_fit(start.displacement, settled=False))
+    contact = knows(0.95, fit=replace(a_fit(start.displacement), status=FitStatus.CONTACT))
+    steps = {"a": knows(0.5), "b": knows(0.8), "c": loose, "d": contact, "e": knows(0.6)}
+    model, training_only = select_refinement(steps, start, start, a_surface())
+    assert [(refinement.name, refinement.kept) for refinement in model.refinements] == [
+        ("a", False),
+        ("b", True),
+        ("e", False),
+    ]
+    assert_allclose(model.displacement, 0.8 * motion(start.system.mesh.points))
+
+    def only_training(model: CollapseModel, target: Target, begin: Fit) -> CollapseModel:
+        whole = len(target.inflated) == len(start.correspondences)
+        return replace(knows(0.9)(model, target, begin), fit=a_fit(start.displacement, settled=not whole))
+
+    model, training_only = select_refinement({"f": only_training, **steps}, start, start, a_surface())
+    assert [refinement.name for refinement in model.refinements if refinement.kept] == ["b"]
+    assert_allclose(training_only.displacement, 0.8 * motion(start.system.mesh.points))
+
+
+def test_refinements_add_up_and_the_last_one_kept_says_what_remains() -> None:
+    model = a_model(refinements=(Refinement("a", 5.0, 4.0, True), Refinement("b", 4.0, 4.5, False)))
+    assert model.held_out_mm == 4.0
+    assert a_model(refinements=(Refinement("a", 5.0, 4.9, False),)).held_out_mm == 5.0
+    assert a_model().held_out_mm is None
+    again, _ = select_refinement({"c": knows(0.9)}, model, model, a_surface())
+    assert [refinement.name for refinement in again.refinements] == ["a", "b", "c"]
+
+
+def test_too_few_or_too_crowded_keypoints_judge_nothing() -> None:
+    assert _too_few(pairs_of()) is None
+    assert _too_few(pairs_of(39)) == "only 39 keypoints were matched inside the lung"
+    many = pairs_of(2000)
+    hidden, shown = np.flatnonzero(held_out(many.fixed)), np.flatnonzero(~held_out(many.fixed))
+    for h, s in ((10, 30), (40, 10)):
+        assert _too_few(many.only(np.concatenate([hidden[:h], shown[:s]]))) is None
+    for h, s in ((9, 31), (41, 9)):
+        assert "too close together" in str(_too_few(many.only(np.concatenate([hidden[:h], shown[:s]]))))
+
+
+def test_every_border_but_a_fissure_is_a_target_with_its_own_confidence_and_normal() -> None:
+    count = 12
+    rng = np.random.default_rng(1)
+    border = np.array([Border.AIR, Border.FISSURE, Border.CONTACT, Border.DENSE] * 3, dtype=np.int8)
+    seen = SurfacePoints(rng.normal(size=(count, 3)), rng.normal(size=(count, 3)), rng.uniform(size=count), border)
+    target = surface_target(seen)
+    kept = np.flatnonzero(border != Border.FISSURE)
+    assert_array_equal(target.points, seen.points[kept])
+    assert_array_equal(target.normals, seen.normals[kept])
+    assert_array_equal(target.weights, seen.confidence[kept])
+    assert len(target.inflated) == 0
+    for kind in Border:
+        assert_array_equal(seen.only(kind).points, seen.points[border == kind])
+        assert_array_equal(seen.only(kind).confidence, seen.confidence[border == kind])
+        assert_array_equal(seen.only(kind).normals, seen.normals[border == kind])
+        assert set(seen.only(kind).border) == {kind}
+
+
+def test_settings_of_a_run_reach_the_fit() -> None:
+    usual = fit_settings(settings_of("balanced"))
+    assert (usual.plain, usual.free, usual.kappa_decades) == (False, (True, True, True), FitSettings.kappa_decades)
+    tables = {"model": {"cost": "plain", "diaphragm": False, "max_steps": 7}, "keypoints": {"sigma_mm": 1.25}}
+    paper = fit_settings(settings_of("balanced", tables), 2)
+    assert (paper.plain, paper.free) == (True, (True, True, False, True, True))
+    assert (paper.max_steps, paper.keypoint_sigma_mm, paper.kappa_decades) == (7, 1.25, np.inf)
+
+
+@pytest.mark.parametrize(
+    ("share", "before", "taken"),
+    [(0.0005, 0.0, True), (0.002, 0.0, False), (0.002, 0.002, True), (0.004, 0.002, False)],
+)
+def test_a_correction_that_turns_more_elements_inside_out_is_refused(
+    monkeypatch: pytest.MonkeyPatch, share: float, before: float, taken: bool
+) -> None:
+    start = a_model(0.3)
+    start = replace(start, fit=a_fit(start.displacement, tets=10000, inverted=before))
+    field = np.random.default_rng(2).normal(size=start.displacement.shape)
+    asked: list[Any] = []
+
+    def constraints_to(target: Target, lung: TetMesh, u: Array, settings: FitSettings) -> str:
+        asked.append((target, lung, u, settings))
+        return "constraints"
+
+    def elastic_correction(lung: TetMesh, u: Array, tissue: Any, wanted: Any, strain: float) -> Any:
+        asked.append((lung, u, wanted, strain))
+        return SimpleNamespace(u=field, det_f=np.where(np.arange(10000) < share * 10000, -1.0, 1.0))
+
+    monkeypatch.setattr(module, "constraints_to", constraints_to)
+    monkeypatch.setattr(module, "elastic_correction", elastic_correction)
+    target, settings = a_surface(), FitSettings(keypoint_sigma_mm=1.25)
+    found = corrected(0.03, settings)(start, target, start.fit)
+    assert (found is not start) is taken
+    assert asked[0] == (target, start.system.mesh, start.displacement, settings)
+    assert asked[1] == (start.system.mesh, start.displacement, "constraints", 0.03)
+    if taken:
+        assert_allclose(found.displacement, start.displacement + field)
+
+
+@pytest.mark.parametrize(("hilum", "count"), [(True, 12), (False, 6)])
+def test_the_regional_fit_sets_stretches_and_hilum_free_and_starts_where_it_is_told(
+    monkeypatch: pytest.MonkeyPatch, hilum: bool, count: int
+) -> None:
+    @dataclass(frozen=True)
+    class System:
+        mesh: TetMesh
+        hilum: Array
+        tissue: Tissue
+        modes: tuple[Any, ...] = ()
+
+    start = replace(a_model(), system=System(mesh(), HILUM, Tissue()))  # type: ignore[arg-type]
+    asked: list[tuple[Any, ...]] = []
+    answer = a_fit(0.4 * motion(mesh().points))
+
+    def fit(*values: Any) -> Any:
+        asked.append(values)
+        return answer
+
+    monkeypatch.setattr(module, "fit_collapse", fit)
+    target = a_surface()
+    begin = replace(start.fit, theta=Theta(1e-9, 0.7, 4.0, (0.1, 0.2)))
+    found = _regional(settings_of("balanced", {"model": {"hilum": hilum}}))(start, target, begin)
+    ((system, seen, settings),) = asked
+    assert seen is target
+    assert len(system.modes) == count
+    assert sum(mode.name.startswith("strain") for mode in system.modes) == 6
+    assert len(settings.free) == 3 + count
+    assert settings.starts == ((1e-9, 0.7, 4.0, 0.1, 0.2),)
+    assert found.system is system
+    assert found.fit is answer
+    assert_array_equal(found.displacement, answer.state.u)
+
+
+class Selection:
+    """`select_model` with a plain fit that knows 20 % of the collapse, and corrections that know all of it when shown
+    all.
+    """
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, pairs: Correspondences) -> None:
+        lung = mesh()
+        self.plain = a_fit(0.1 * motion(lung.points))
+        self.solid = a_fit(0.2 * motion(lung.points)).state
+        self.asked: dict[str, tuple[Any, ...]] = {}
+        self.stages = Stages()
+        self.observed: Any = SimpleNamespace(
+            model_mesh=lung,
+            hilum_nodes=HILUM,
+            motion=SimpleNamespace(displacement=HILUM_MM),
+            surface=scene.air_surface(30),
+        )
+        self.others = np.full((4, *lung.points.shape), 2.0)
+        system = SimpleNamespace(mesh=lung, gravity=GRAVITY, hilum=HILUM)
+        chosen = StrainChoice(self.solid, Strain.FINITE, "because", 0.01, None)
+        for name, answer in (
+            ("assemble", system),
+            ("fit_collapse", self.plain),
+            ("keep_in_range", chosen),
+            ("find_correspondences", pairs),
+            ("perturbation_ensemble", self.others),
+        ):
+            monkeypatch.setattr(module, name, self._asked(name, answer))
+        whole = len(pairs)
+
+        def corrected(_strain: float, data: FitSettings) -> Any:
+            assert data == fit_settings(self.settings)
+            return lambda m, t, s: knows(1.0 if len(t.inflated) == whole else 0.7)(m, t, s)
+
+        monkeypatch.setattr(module, "corrected", corrected)
+
+    def _asked(self, name: str, answer: Any) -> Any:
+        def ask(*values: Any, **named: Any) -> Any:
+            self.asked[name] = (*values, *named.values())
+            return answer
+
+        return ask
+
+    def run(self, **tables: Any) -> CollapseModel:
+        tables = {"model": {"regional": False}, **tables}
+        self.settings = settings_of("balanced", tables)
+        self.prepared: Any = object()
+        return select_model(GRAVITY, self.prepared, self.observed, self.settings, self.stages)
+
+
+def test_the_plain_fit_is_made_of_what_was_observed(monkeypatch: pytest.MonkeyPatch) -> None:
+    known = Selection(monkeypatch, pairs_of())
+    known.run()
+    lung, _, gravity, hilum, hilum_mm = known.asked["assemble"]
+    assert lung is known.observed.model_mesh
+    assert_array_equal(gravity, GRAVITY)
+    assert_array_equal(hilum, HILUM)
+    assert_array_equal(hilum_mm, HILUM_MM)
+    assert_array_equal(known.asked["fit_collapse"][1].points, known.observed.surface.points)
+    assert known.asked["fit_collapse"][2] == fit_settings(known.settings)
+    assert known.asked["keep_in_range"][1] is known.plain.state
+    (choice,) = known.stages.choices
+    assert (choice.part, choice.kept, choice.value, choice.limit) == ("finite strain", True, 0.01, 0.001)
+
+
+def test_keypoints_are_matched_where_the_strain_measure_that_holds_puts_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    known = Selection(monkeypatch, pairs_of())
+    model = known.run()
+    prepared, observed, displacement, settings = known.asked["find_correspondences"]
+    assert prepared is known.prepared
+    assert observed is known.observed
+    assert_array_equal(displacement, known.solid.u)
+    assert settings == known.settings.keypoints
+    lung = known.observed.model_mesh.points
+    assert_allclose(model.displacement, motion(lung))
+    assert_allclose(model.ensemble, -0.3 * motion(lung)[None], atol=1e-12)
+    assert "perturbation_ensemble" not in known.asked
+    assert [refinement.name for refinement in model.refinements] == [
+        f"elastic correction, strain {s:g}" for s in (0.05, 0.025, 0.0125)
+    ]
+    assert sum(refinement.kept for refinement in model.refinements) == 1
+
+
+@pytest.mark.parametrize(
+    ("pairs", "tables", "skipped"),
+    [
+        (pairs_of(), {"keypoints": {"on": False}}, {"keypoints": "switched off in the settings"}),
+        (pairs_of(20), {}, {"regional fit": "only 20 keypoints were matched inside the lung"}),
+        (pairs_of(), {"model": {"regional": False, "correct": False}}, {}),
+    ],
+)
+def test_without_a_refinement_the_plain_fit_stands_and_the_ensemble_says_how_sure_it_is(
+    monkeypatch: pytest.MonkeyPatch, pairs: Correspondences, tables: dict[str, Any], skipped: dict[str, str]
+) -> None:
+    known = Selection(monkeypatch, pairs)
+    model = known.run(**tables)
+    assert_array_equal(model.displacement, known.solid.u)
+    assert model.fit.state is known.solid
+    assert model.refinements == ()
+    assert known.stages.skipped == skipped
+    assert_array_equal(model.ensemble, known.others)
+    assert known.asked["perturbation_ensemble"][2] is known.plain
+    assert len(model.correspondences) == (0 if "keypoints" in skipped else len(pairs))
+    assert len(NO_CORRESPONDENCES) == 0

@@ -1,0 +1,119 @@
+"""Uncertainty of a point: the images' where they placed it, the model's where they did not, never less than a keypoint
+nearby allows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from poro.mesh import TetMesh, stuff
+from registration.correspondences import Correspondences
+from registration.maps.rigid import RigidTransform
+from vatsloc.workflow.uncertainty import MODEL_ALONE_MM, correspondence_sigma_mm, covariance, radius95, scatter
+
+QUANTILE = np.sqrt(7.814728)  # of chi-squared with three degrees of freedom, 95 %
+
+
+@dataclass
+class Scene:
+    """A ball of a lung that stays where it is, whose fit knows its only parameter to 2 mm along x."""
+
+    mesh: TetMesh
+    seen: Any = None
+    disagreement_mm: Any = None
+    keypoints: Any = None
+    missed: Any = 0.0
+    ensemble: Any = field(default_factory=lambda: np.zeros((0, 0, 3)))
+
+    @property
+    def pose(self) -> Any:
+        return SimpleNamespace(mesh_inf=self.mesh, points_inf=self.mesh.points)
+
+    @property
+    def collapse(self) -> Any:
+        n = len(self.mesh.points)
+        along_x = np.zeros((n, 3, 1))
+        along_x[:, 0] = 1.0
+        fit = SimpleNamespace(sensitivity=along_x, covariance=np.array([[4.0]]), surface_rms_mm=9, keypoint_rms_mm=9)
+        found = () if self.keypoints is None else Correspondences.of(self.keypoints, self.keypoints + self.missed)
+        model = SimpleNamespace(
+            ensemble=self.ensemble, correspondences=found, refinements=() if self.keypoints is None else ("tried",)
+        )
+        corrected = SimpleNamespace(seen=self.seen, disagreement_mm=self.disagreement_mm)
+        return SimpleNamespace(
+            def_from_inf_rigid=RigidTransform.about(np.zeros(3), np.zeros(3), np.zeros(3)),
+            residual=None if self.seen is None else corrected,
+            model=model,
+            system=SimpleNamespace(mesh=self.mesh),
+            fit=fit,
+            mesh_before=self.mesh,
+            mesh_after=self.mesh,
+        )
+
+    def covariance(self, *points: list[float]) -> Any:
+        at = np.array(points)
+        return covariance(self.pose, self.collapse, at, at)
+
+
+@pytest.fixture
+def ball() -> TetMesh:
+    affine = np.diag([4.0, 4.0, 4.0, 1.0])
+    affine[:3, 3] = -40
+    x = np.stack(np.meshgrid(*3 * [np.arange(21)], indexing="ij"), axis=-1) * 4.0 - 40
+    return stuff(np.linalg.norm(x, axis=-1) < 36, affine, 14.0)
+
+
+def test_without_images_inside_the_model_is_as_unsure_as_it_was_measured_to_be(ball: TetMesh) -> None:
+    expected = np.diag([4.0, 0, 0]) + MODEL_ALONE_MM**2 * np.eye(3)
+    assert_allclose(Scene(ball).covariance([0, 0, 0], [10, 0, 0]), [expected, expected], atol=1e-9)
+    assert_allclose(radius95(Scene(ball).pose, Scene(ball).collapse), QUANTILE * np.sqrt(20), rtol=1e-9)
+
+
+def test_where_registrations_placed_the_tissue_their_disagreement_counts(ball: TetMesh) -> None:
+    right = ball.points[:, 0] > 0
+    scene = Scene(ball, seen=right, disagreement_mm=np.full(len(ball.points), 2.0))
+    (placed, guessed) = scene.covariance([25, 0, 0], [-25, 0, 0])
+    assert_allclose(placed, 1.5 * np.eye(3), atol=1e-9)
+    assert_allclose(guessed, np.diag([20.0, 16, 16]), atol=1e-9)
+
+
+def test_nothing_is_surer_than_the_keypoints_about_it_allow(ball: TetMesh) -> None:
+    n = len(ball.points)
+    keypoints = np.array([[-20.0, 0, 0], [-20.0, 4, 0]])
+    scene = Scene(ball, np.ones(n, bool), np.zeros(n), keypoints=keypoints)
+    near, far = scene.covariance([-20, 0, 0], [20, 0, 0])
+    assert_allclose(near, 0.5 * np.eye(3), atol=1e-9)
+    assert_allclose(far, (0.15 * 32) ** 2 * np.eye(3), atol=1e-9)
+    missed = Scene(
+        ball, np.ones(n, bool), np.zeros(n), keypoints=keypoints, missed=np.array([[2.0, 0, 0], [0, 0, 4.0]])
+    )
+    near, far = missed.covariance([-20, 0, 0], [20, 0, 0])
+    assert_allclose(near, (1.5 * 3) ** 2 * np.eye(3), atol=1e-9)
+    assert_allclose(far, (1.5 * 3 + 0.15 * 32) ** 2 * np.eye(3), atol=1e-9)
+
+
+def test_sigma_grows_with_misfit_and_beyond_reach_with_distance() -> None:
+    distances, misfits = np.array([0.0, 8.0, 28.0, 0.0]), np.array([0.5, 0.5, 0.5, 2.0])
+    assert_allclose(correspondence_sigma_mm(distances, misfits), [0.75, 0.75, 0.75 + 0.15 * 20, 3.0])
+
+
+def test_tissue_is_no_surer_than_the_registration_that_matched_the_keypoints_about_it() -> None:
+    assert_allclose(correspondence_sigma_mm(np.zeros(3), np.array([0.0, 0.3, 0.4])), [0.5, 0.5, 0.6])
+
+
+def test_tissue_is_no_surer_than_the_registration_that_found_the_places_about_it() -> None:
+    assert_allclose(correspondence_sigma_mm(np.zeros(3), np.array([0.0, 0.3, 0.4])), [0.5, 0.5, 0.6])
+
+
+def test_scatter_is_the_second_moment_of_the_other_answers(ball: TetMesh) -> None:
+    members = np.zeros((2, len(ball.points), 3))
+    members[0, :, 0], members[1, :, 1] = 2.0, 4.0
+    scene = Scene(ball, ensemble=members)
+    assert_allclose(scatter(scene.collapse, np.zeros((1, 3))), [np.diag([2.0, 8.0, 0.0])], atol=1e-9)
+    assert_allclose(scatter(Scene(ball).collapse, np.zeros((1, 3))), np.zeros((1, 3, 3)))
+    assert_allclose(scene.covariance([0, 0, 0]), [np.diag([22.0, 24.0, 16.0])], atol=1e-9)

@@ -1,0 +1,1 @@
+"""Benchmarks: this program beside others, in seconds, memory and error."""

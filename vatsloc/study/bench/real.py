@@ -1,0 +1,130 @@
+"""Benchmark on real lungs: one breath-hold's lungs moved into the other's by shape alone, scored at landmarks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from poro.arrays import Array
+from poro.mesh import TetMesh, interpolate, locate
+from vatsloc.evaluation.statistics import distances, summarize
+from vatsloc.study.bench.affine import affine_to_points, affine_to_shape
+from vatsloc.study.bench.breathing import WALL_ALONE, Breathing, Lung, breathe_out
+from vatsloc.study.bench.breaths import Marks, read_person
+
+EDGE_MM = 12.0
+UNMOVED, CENTROID, SHAPE_AFFINE = "unmoved", "centroid of the shape", "affine map fitted to the shape"
+ELASTIC = "elastic lung that slides on its wall"
+BREATHING = "the same with weight, bronchi and ribs"
+TRUE_AFFINE = "affine map fitted to the landmarks"
+"""The last row has seen the truth: it is what a map of twelve numbers per lung can reach at best."""
+
+Predict = Callable[[Lung], Array]
+
+
+def by_centroid(lung: Lung) -> Array:
+    """Nodes shifted as the lung's centre is."""
+    return lung.inspired.points + _centre(lung.expired) - _centre(lung.inspired)
+
+
+def by_shape_affine(lung: Lung) -> Array:
+    """Nodes moved by the affine map that lays surface on surface."""
+    return affine_to_shape(lung.inspired.boundary, lung.expired.boundary)(lung.inspired.points)
+
+
+ROWS: dict[str, Predict] = {
+    UNMOVED: lambda lung: lung.inspired.points,
+    CENTROID: by_centroid,
+    SHAPE_AFFINE: by_shape_affine,
+    ELASTIC: lambda lung: breathe_out(lung, WALL_ALONE),
+    BREATHING: lambda lung: breathe_out(lung, Breathing()),
+}
+"""Predictions of where the inspired lung's nodes (n, 3) lie after expiration; they are given no landmark."""
+
+
+def bench_real(folders: Sequence[Path], say: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
+    """Errors at the landmarks of every person, from inspiration to expiration and (`back`) the other way, per lung and
+    pooled; a case's own figures are those of the row `BREATHING`.
+
+    Raises as `read_person`.
+    """
+    return {"cases": [measure(folder, say) for folder in folders]}
+
+
+def measure(folder: Path, say: Callable[[str], None]) -> dict[str, Any]:
+    """All rows of one person, both ways. seconds: reading, meshing and the row `BREATHING`."""
+    began = perf_counter()
+    person = read_person(folder)
+    say(f"{person.name}: reading and meshing ...")
+    lungs = person.lungs(EDGE_MM)
+    marks = [person.marks(lung.side) for lung in lungs]
+    out: dict[str, Any] = {}
+    back: dict[str, Any] = {}
+    seconds = perf_counter() - began
+    for name, predict in ROWS.items():
+        say(f"{person.name}: {name} ...")
+        began = perf_counter()
+        moved = [predict(lung) for lung in lungs]
+        if name == BREATHING:
+            seconds += perf_counter() - began
+        ways = [errors(lung, there, known) for lung, there, known in zip(lungs, moved, marks, strict=True)]
+        out[name] = _row({lung.side: way[0] for lung, way in zip(lungs, ways, strict=True)})
+        back[name] = _row({lung.side: way[1] for lung, way in zip(lungs, ways, strict=True)})
+    out[TRUE_AFFINE] = _row({g.side: _affine_errors(m.inspired, m.expired) for g, m in zip(lungs, marks, strict=True)})
+    back[TRUE_AFFINE] = _row({g.side: _affine_errors(m.expired, m.inspired) for g, m in zip(lungs, marks, strict=True)})
+    return {
+        "name": person.name,
+        **_way("inspiration to expiration", out),
+        "seconds": seconds,
+        "back": _way("expiration to inspiration", back),
+    }
+
+
+def errors(lung: Lung, moved: Array, marks: Marks) -> tuple[Array, Array]:
+    """Errors (k,) mm at the landmarks out and back: the way back is the inverse of the way out."""
+    motion = moved - lung.inspired.points
+    out = marks.inspired + interpolate(locate(lung.inspired, marks.inspired), motion)
+    back = marks.expired - interpolate(locate(TetMesh(moved, lung.inspired.tets), marks.expired), motion)
+    return distances(out, marks.expired), distances(back, marks.inspired)
+
+
+def table(result: dict[str, Any]) -> str:
+    """The benchmark as text: mean / 95 % / maximum in mm."""
+    lines = []
+    for case in result["cases"]:
+        for way in (case, case["back"]):
+            lines.append(f"{case['name']}, {way['direction']}: mean / 95 % / maximum in mm at the landmarks")
+            lungs = list(next(iter(way["rows"].values())))
+            lines.append(" " * 42 + "".join(f"{lung:>22s}" for lung in lungs))
+            for name, row in way["rows"].items():
+                cells = (f"{s['mean']:.2f} / {s['p95']:.1f} / {s['max']:.1f}" for s in row.values())
+                lines.append(f"  {name:40s}" + "".join(f"{cell:>22s}" for cell in cells))
+    return "\n".join(lines)
+
+
+def _way(direction: str, rows: dict[str, Any]) -> dict[str, Any]:
+    best = rows[BREATHING]["both"]
+    figures = {key: best[key] for key in ("mean", "p95", "max")}
+    return {"direction": direction, "initial_mean": rows[UNMOVED]["both"]["mean"], **figures, "rows": rows}
+
+
+def _row(errors_mm: dict[str, Array]) -> dict[str, Any]:
+    every = errors_mm | {"both": np.concatenate(list(errors_mm.values()))}
+    return {lung: _statistics(e) for lung, e in every.items()}
+
+
+def _affine_errors(points: Array, images: Array) -> Array:
+    return distances(affine_to_points(points, images)(points), images)
+
+
+def _statistics(errors_mm: Array) -> dict[str, float | int]:
+    s = summarize(errors_mm)
+    return {"mean": s.mean, "p95": s.p95, "max": s.max, "n": s.n}
+
+
+def _centre(mesh: TetMesh) -> Array:
+    return np.average(mesh.points, axis=0, weights=mesh.node_volumes)

@@ -1,0 +1,226 @@
+"""The chart: what each part of the method buys in millimetres, and what it costs in seconds, over a set of cases."""
+
+from __future__ import annotations
+
+import csv
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import astuple, dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from poro.fit import FitStatus
+from registration.maps.rigid import RigidTransform
+from registration.volume import Array
+from vatsloc.case import Case, read_case
+from vatsloc.errors import InputRefused, NotConverged, VatslocError
+from vatsloc.evaluation.inputs import Truth, read_truth
+from vatsloc.evaluation.statistics import summarize
+from vatsloc.evaluation.tre import RunMaps, target_registration_errors
+from vatsloc.study.chart.variants import Scored, Variant
+from vatsloc.study.cohort.scored import run_maps
+from vatsloc.workflow.pneumothorax import pneumothorax
+from vatsloc.workflow.pose import ChangeOfPose, change_of_pose
+from vatsloc.workflow.prepare import Prepared, prepare
+from vatsloc.workflow.settings import load_settings
+from vatsloc.workflow.stages import Say, Stages, quiet
+
+RUNS = "runs.csv"
+PHASES = ("phase1", "phase2", "chain")
+SPINES = {"phase1": "spine CT to inflated", "phase2": "spine inflated to deflated"}
+NAN = float("nan")
+
+
+@dataclass(frozen=True)
+class Row:
+    """One variant on one case. *_mean, *_p95: target registration errors, mm; *_seconds: of what the phase needs, the
+    chain's from the images on disk to the nodule's place; *_cpu: the same as processor seconds, which other programs
+    disturb less; load: processes that ran on the machine at its end; failed: why there is no number.
+    """
+
+    variant: str
+    case: str
+    phase1_mean: float = NAN
+    phase1_p95: float = NAN
+    phase1_seconds: float = NAN
+    phase1_cpu: float = NAN
+    phase2_mean: float = NAN
+    phase2_p95: float = NAN
+    phase2_seconds: float = NAN
+    phase2_cpu: float = NAN
+    chain_mean: float = NAN
+    chain_p95: float = NAN
+    chain_seconds: float = NAN
+    chain_cpu: float = NAN
+    nodule_mm: float = NAN
+    load: float = NAN
+    failed: str = ""
+
+
+def run_chart(cases: Sequence[Path], variants: Mapping[str, Variant], out: Path, say: Say = quiet) -> list[Row]:
+    """Run every variant on every case that out/runs.csv lacks; all its rows, of this run's and of earlier ones."""
+    out.mkdir(parents=True, exist_ok=True)
+    known = {(row.variant, row.case) for row in read_rows(out / RUNS)}
+    warm = False
+    for folder in cases:
+        name = folder.resolve().name
+        missing = {v: variant for v, variant in variants.items() if (v, name) not in known}
+        if not missing:
+            continue
+        if not warm:
+            say(f"{name}: a run to compile and warm the kernels ...")
+            warm_up(folder)
+            warm = True
+        for row in measure_case(folder, missing):
+            append_row(out / RUNS, row)
+            say(
+                f"{name}, {row.variant}: "
+                + (row.failed or f"phase 1 {row.phase1_mean:.2f}, chain {row.chain_mean:.2f} mm")
+            )
+    return read_rows(out / RUNS)
+
+
+def warm_up(folder: Path) -> None:
+    """Let everything be compiled that a run needs."""
+    case, settings, stages = read_case(folder), load_settings("fast", None), Stages()
+    prepared = prepare(case, stages)
+    pneumothorax(case, prepared, change_of_pose(case, prepared, settings, stages), settings, stages)
+
+
+@dataclass(frozen=True)
+class _Cost:
+    """What stages took: seconds by the clock and of the processors."""
+
+    seconds: float
+    cpu: float
+
+    @staticmethod
+    def of(stages: Stages, *names: str) -> _Cost:
+        """Of the named stages, of all without names."""
+        chosen = names or tuple(stages.seconds)
+        return _Cost(sum(stages.seconds[n] for n in chosen), sum(stages.cpu_seconds[n] for n in chosen))
+
+    def __add__(self, other: _Cost) -> _Cost:
+        return _Cost(self.seconds + other.seconds, self.cpu + other.cpu)
+
+    def named(self, phase: str) -> dict[str, Any]:
+        """Columns of a row."""
+        return {f"{phase}_seconds": self.seconds, f"{phase}_cpu": self.cpu}
+
+
+@dataclass
+class _CaseRuns:
+    """A case whose images are read and prepared once; what that took counts for every variant."""
+
+    case: Case
+    truth: Truth
+    prepared: Prepared
+    cost: _Cost
+    poses: dict[str, tuple[ChangeOfPose, _Cost]] = field(default_factory=dict)
+
+    def pose(self, variant: Variant) -> tuple[ChangeOfPose, _Cost]:
+        """Phase 1 and its cost; the same one is not run again."""
+        settings = variant.settings
+        left_out = settings.leave_out.first_registration_mm
+        key = f"{variant.register.__name__} {settings.registration} {settings.mesh.edge_mm} {left_out}"
+        if key not in self.poses:
+            stages = Stages()
+            found = change_of_pose(self.case, self.prepared, settings, stages, variant.register)
+            self.poses[key] = found, _Cost.of(stages)
+        return self.poses[key]
+
+
+def measure_case(folder: Path, variants: Mapping[str, Variant]) -> Iterator[Row]:
+    """A row per variant. What a user can act on becomes the row's `failed`."""
+    stages = Stages()
+    with stages.stage("read"):
+        case = read_case(folder)
+    prepared = prepare(case, stages)
+    runs = _CaseRuns(case, read_truth(folder), prepared, _Cost.of(stages))
+    for name, variant in variants.items():
+        row = Row(name, folder.resolve().name)
+        try:
+            row = _spines(runs, variant, row) if variant.scored is Scored.SPINES else _run(runs, variant, row)
+        except (VatslocError, ImportError) as error:
+            row = replace(row, failed=str(error).split("\n")[0])
+        yield replace(row, load=os.getloadavg()[0])
+
+
+def _run(runs: _CaseRuns, variant: Variant, row: Row) -> Row:
+    pose, pose_cost = runs.pose(variant)
+    phase1 = runs.cost + pose_cost
+    rigid = pose.inf_from_ct_rigid
+    if variant.scored is Scored.POSE:
+        maps = RunMaps(rigid, rigid, rigid, pose.inf_from_ct, rigid, rigid)
+        return replace(_scored(runs.truth, maps, row, ("phase1",)), **phase1.named("phase1"))
+    stages = Stages()
+    collapse = pneumothorax(runs.case, runs.prepared, pose, variant.settings, stages)
+    if collapse.fit.status is FitStatus.CONTACT:
+        raise NotConverged("the contact of the collapsing lung did not settle")
+    maps = run_maps(pose, collapse)
+    nodule = maps.def_from_inf(pose.inf_from_ct(runs.case.nodule.centre_ras[None]))
+    row = _spent(replace(row, nodule_mm=_off(nodule, runs.truth)), phase1, _Cost.of(stages))
+    return _scored(runs.truth, maps, row, PHASES)
+
+
+def _spines(runs: _CaseRuns, variant: Variant, row: Row) -> Row:
+    """The pose alone: what both phases start from."""
+    stages = Stages()
+    pose = change_of_pose(runs.case, runs.prepared, variant.settings, stages, variant.register)
+    rigid = pose.inf_from_ct_rigid
+    collapse = pneumothorax(runs.case, runs.prepared, pose, variant.settings, stages)
+    there, back = (_Cost.of(stages, SPINES[phase]) for phase in ("phase1", "phase2"))
+    def_from_inf: RigidTransform = collapse.def_from_inf_rigid
+    chain = def_from_inf @ rigid
+    maps = RunMaps(rigid, chain, def_from_inf, rigid, def_from_inf, chain)
+    nodule = chain(runs.case.nodule.centre_ras[None])
+    row = _spent(replace(row, nodule_mm=_off(nodule, runs.truth)), runs.cost + there, back)
+    return _scored(runs.truth, maps, row, PHASES)
+
+
+def _scored(truth: Truth, maps: RunMaps, row: Row, phases: Sequence[str]) -> Row:
+    errors = target_registration_errors(truth.landmarks, maps).mm
+    found = {phase: summarize(errors[phase]) for phase in phases}
+    return replace(
+        row, **{f"{phase}_{what}": getattr(s, what) for phase, s in found.items() for what in ("mean", "p95")}
+    )
+
+
+def _spent(row: Row, phase1: _Cost, phase2: _Cost) -> Row:
+    return replace(row, **phase1.named("phase1"), **phase2.named("phase2"), **(phase1 + phase2).named("chain"))
+
+
+def _off(predicted: Array, truth: Truth) -> float:
+    true = truth.nodule.nodule_deflated_ras
+    return NAN if true is None else float(np.linalg.norm(predicted[0] - true))
+
+
+def append_row(path: Path, row: Row) -> None:
+    """Add a line to the table, and its head where it is new."""
+    new = not path.exists()
+    with path.open("a", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        if new:
+            writer.writerow(f.name for f in fields(Row))
+        writer.writerow("" if v != v else f"{v:.4g}" if isinstance(v, float) else v for v in astuple(row))
+
+
+def read_rows(path: Path) -> list[Row]:
+    """Rows of a table that `append_row` wrote, none where it is missing. Raises InputRefused for another table."""
+    if not path.exists():
+        return []
+    with path.open(newline="", encoding="utf-8") as file:
+        table = csv.DictReader(file)
+        if table.fieldnames != [f.name for f in fields(Row)]:
+            raise InputRefused(f"{path} is not a table of this version's chart; give another --out.")
+        texts = ("variant", "case", "failed")
+        try:
+            return [_row({k: v if k in texts else float(v or "nan") for k, v in line.items()}) for line in table]
+        except (TypeError, ValueError) as error:
+            raise InputRefused(f"{path} has a damaged line ({error}); delete the line and go on.") from error
+
+
+def _row(values: dict[str, Any]) -> Row:
+    return Row(**values)

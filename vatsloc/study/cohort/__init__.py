@@ -1,0 +1,1 @@
+"""Many cases: made, run, scored and put into one table."""

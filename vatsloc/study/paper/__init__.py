@@ -1,0 +1,1 @@
+"""The experiments of Alvarez 2021, repeated on any cases."""

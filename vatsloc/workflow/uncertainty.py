@@ -1,0 +1,104 @@
+"""Uncertainty of where tissue lies after the collapse, at the nodule and everywhere else in the lung."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from poro.fit import ellipsoid95, point_covariance
+from poro.fit.covariance import CHI2_95_3D
+from poro.mesh import interpolate, locate
+from registration.verification import LeftOver
+from registration.volume import Array
+from vatsloc.workflow.pneumothorax import Collapse
+from vatsloc.workflow.pose import ChangeOfPose
+
+REGISTRATION_MM = 0.5
+"""Standard deviation per axis of one registration where it holds: a quarter of its finest voxel."""
+MODEL_ALONE_MM = 4.0
+"""The same of the model without images inside the lung: 1.7 to 6.9 mm on twins and phantoms."""
+NEAREST, PER_MISFIT, REACH_MM, PER_MM = 6, 1.5, 8.0, 0.15
+"""The same near matched keypoints: PER_MISFIT for every millimetre by which the result misses the six nearest ones on
+average, and PER_MM for every millimetre beyond REACH_MM from the nearest one. Quantile regression (95 %) of the
+chain's errors at 16,000 tissue points of the three twins and of five phantoms outside the suite (adhesion 205,
+near-total-collapse 206, part-solid 207, base 208, poor-dose 209)."""
+
+
+CHECK_REACH_MM = 30.0
+"""An error that the run's check of itself found counts for tissue within this distance."""
+
+
+def covariance(
+    pose: ChangeOfPose, collapse: Collapse, inflated: Array, deflated: Array, left: LeftOver | None = None
+) -> Array:
+    """Covariance (n, 3, 3) mm2 of where points (n, 3) of the inflated CBCT lie in the deflated one, given with where
+    the run puts them (n, 3).
+
+    Where the images placed the tissue around a point, it holds the registrations' errors and their disagreement; where
+    they did not, the fit's covariance and the scatter of the ensemble. Either way its standard deviation is at least
+    that of the nearest keypoints: from their distance, and from how well the result follows them. left: the error of
+    the chain that the run's check of itself found; where it lies outside the ellipsoid, the covariance is widened.
+    """
+    own = _covariance(pose, collapse, inflated, deflated)
+    return own if left is None else widened(own, left.near(deflated, CHECK_REACH_MM))
+
+
+def widened(covariance: Array, vectors: Array) -> Array:
+    """Covariances (n, 3, 3) mm2 with the outer product of vectors (n, 3) mm added where their ellipsoids (95 %) do not
+    hold these; a vector that is not known (NaN) widens nothing.
+    """
+    known: Array = np.asarray(np.isfinite(vectors).all(axis=1))
+    v = np.where(known[:, None], vectors, 0.0)
+    against = np.linalg.solve(covariance, v[..., None])[..., 0]
+    beyond: Array = np.asarray((v * against).sum(axis=1) > CHI2_95_3D)
+    return np.asarray(covariance + np.where(beyond[:, None, None], v[:, :, None] * v[:, None, :], 0.0))
+
+
+def _covariance(pose: ChangeOfPose, collapse: Collapse, inflated: Array, deflated: Array) -> Array:
+    points = collapse.def_from_inf_rigid(inflated)
+    residual = collapse.residual
+    least_mm, model_mm = np.zeros(len(points)), np.full(len(points), MODEL_ALONE_MM)
+    if collapse.model.refinements:
+        least_mm = model_mm = correspondence_sigma_mm(*nearest_correspondences(collapse, deflated))
+    modelled = point_covariance(collapse.fit, collapse.system, points, model_mm) + scatter(collapse, points)
+    if residual is None:
+        return modelled
+    at = locate(pose.mesh_inf, inflated)
+    trust = interpolate(at, residual.seen.astype(float))
+    disagreement = interpolate(at, np.where(residual.seen, residual.disagreement_mm, 0.0))
+    known = np.maximum(2 * REGISTRATION_MM**2 + (disagreement / 2) ** 2, least_mm**2)
+    return np.asarray((trust * known)[:, None, None] * np.eye(3) + (1 - trust)[:, None, None] * modelled)
+
+
+def radius95(pose: ChangeOfPose, collapse: Collapse, left: LeftOver | None = None) -> Array:
+    """Longest semi-axis (n,) mm of the ellipsoid that holds the tissue of each of the lung's nodes with 95 %."""
+    return ellipsoid95(covariance(pose, collapse, pose.points_inf, collapse.mesh_after.points, left))[0][:, 0]
+
+
+def scatter(collapse: Collapse, points: Array) -> Array:
+    """Second moment (n, 3, 3) mm2 of the ensemble about the result, at points (n, 3) before the collapse."""
+    ensemble = collapse.model.ensemble
+    if not len(ensemble):
+        return np.zeros((len(points), 3, 3))
+    at = locate(collapse.system.mesh, points)
+    off = np.array([interpolate(at, difference) for difference in ensemble])
+    return np.asarray(np.einsum("oni,onj->nij", off, off) / len(off))
+
+
+def nearest_correspondences(collapse: Collapse, deflated: Array) -> tuple[Array, Array]:
+    """Distance (n,) mm from points (n, 3) of the deflated CBCT to the nearest keypoint, and by how many mm (n,) the
+    result misses the nearest few of them on average.
+    """
+    found, before = collapse.model.correspondences, collapse.mesh_before
+    moved = interpolate(locate(before, found.moving), collapse.mesh_after.points - before.points)
+    missed = np.linalg.norm(found.moving + moved - found.fixed, axis=1)
+    distance, number = cKDTree(found.fixed).query(deflated, min(NEAREST, len(found)))
+    return distance[:, 0], missed[number].mean(axis=1)
+
+
+def correspondence_sigma_mm(distance_mm: Array, misfit_mm: Array) -> Array:
+    """Standard deviation (n,) mm per axis of tissue at a distance (n,) from the nearest keypoint, where the result
+    misses the nearest keypoints by a misfit (n,). At least that of the registration that matches keypoints.
+    """
+    told = PER_MISFIT * misfit_mm + PER_MM * np.maximum(distance_mm - REACH_MM, 0.0)
+    return np.maximum(told, REGISTRATION_MM)
