@@ -149,7 +149,7 @@ def test_several_series_are_listed(tmp_path, slices):
     assert '[images] ct_series = "..."' in message
 
 
-@pytest.mark.parametrize("wanted", [OTHER, 7, "7", "lung 1.0"])
+@pytest.mark.parametrize("wanted", [OTHER, 7, "7", "lung 1.0"], ids=["uid", "number", "digits", "description"])
 def test_a_series_is_chosen_by_uid_number_or_description(tmp_path, slices, wanted):
     folder = save(tmp_path / "ct", [*slices, *other_series()])
     check(folder, f"ct: left out as another series: {SERIES} (6 slices, CT).", series=wanted, n=4)

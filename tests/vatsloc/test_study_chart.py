@@ -23,7 +23,8 @@ from registration.volume import Mask, Volume
 from tests.vatsloc.browser import CHROMIUM, asked_by_the_page, visit
 from vatsloc.errors import CaseError, InputRefused
 from vatsloc.study.bench.affine import affine_to_points
-from vatsloc.study.chart.chart import Row, append_row, chart, measure_case, read_rows, run_chart
+from vatsloc.study.chart import chart
+from vatsloc.study.chart.chart import Row, append_row, measure_case, read_rows, run_chart
 from vatsloc.study.chart.draw import interactive, page, require_matplotlib, write_chart
 from vatsloc.study.chart.points import dominating, points_of, told_of_presets
 from vatsloc.study.chart.variants import VARIANTS, chosen_variants, masked_only, plain

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from vatsloc.errors import InputRefused
+from vatsloc.study.paper import paper
 from vatsloc.study.paper.draw import page
-from vatsloc.study.paper.paper import CaseRuns, Run, paper, read_runs, run_paper, settings_for
+from vatsloc.study.paper.paper import CaseRuns, Run, read_runs, run_paper, settings_for
 
 
 def runs(case: str = "one") -> CaseRuns:

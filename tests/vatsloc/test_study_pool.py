@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from vatsloc.errors import CaseError
-from vatsloc.study.pool import CONNECT_S, pool
+from vatsloc.study.cohort.pool import CONNECT_S, pool
 
 
 class Client:

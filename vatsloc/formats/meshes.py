@@ -99,6 +99,7 @@ def read_surface(path: Path) -> Surface:
         return Surface(read_points(path).ras, np.empty((0, 3), dtype=int))
     if suffix != ".stl":
         raise CaseError(f"{path} is no surface file; give an .stl, or points in a .mrk.json.")
+    _check_text_stl(path)
     with np.errstate(over="ignore"):  # meshio takes bytes of a text file for a count and multiplies it
         mesh = meshio.stl.read(path)  # a corner that triangles share is one point
     points, triangles = np.asarray(mesh.points, dtype=float), np.asarray(mesh.cells[0].data, dtype=int)
@@ -108,6 +109,19 @@ def read_surface(path: Path) -> Surface:
     if stated is None or stated.group(1) == b"LPS":
         points = flip_points(points)
     return Surface(points, triangles, frame_stated=stated is not None)
+
+
+def _check_text_stl(path: Path) -> None:
+    """Refuse a text STL in which a corner has not three coordinates: meshio would take the first three."""
+    text = path.read_bytes()
+    if not text.lstrip().startswith(b"solid") or b"facet" not in text:
+        return
+    for number, line in enumerate(text.splitlines(), 1):
+        words = line.split()
+        if words[:1] == [b"vertex"] and len(words) != 4:
+            raise InputRefused(
+                f"{path}, line {number}: a corner has {len(words) - 1} coordinates, 3 needed; export it again."
+            )
 
 
 def _flip_vectors(values: Array) -> Array:

@@ -104,7 +104,7 @@ def interactive(rows: Sequence[Row], variants: Mapping[str, Variant], clock: str
         "presets": tuple(PRESETS),
         "ticks": {"s": TICKS_S, "mm": TICKS_MM},
     }
-    environment = jinja2.Environment(loader=jinja2.PackageLoader("vatsloc.study.chart.chart", "."), autoescape=True)
+    environment = jinja2.Environment(loader=jinja2.PackageLoader("vatsloc.study.chart", "."), autoescape=True)
     text = json.dumps(data).replace("<", "\\u003c")
     return environment.get_template("chart.html").render(data=text)
 

@@ -21,7 +21,7 @@ from vatsloc.errors import CaseError
 from vatsloc.formats.casefile import FILE_NAME
 from vatsloc.formats.folder import RUN_FILE, write_whole
 from vatsloc.results import REPORT
-from vatsloc.study.pool import pool
+from vatsloc.study.cohort.pool import pool
 from vatsloc.workflow.stages import Say, quiet
 
 OUTCOME_FILE = "outcome.json"
@@ -173,7 +173,7 @@ def write_tables(out: Path, outcomes: Sequence[Outcome]) -> None:
     rows.writerows(_record(outcome) for outcome in outcomes)
     write_whole(out / "cohort.csv", text.getvalue())
     write_whole(out / "cohort.md", table(outcomes))
-    pages = jinja2.Environment(loader=jinja2.PackageLoader("vatsloc.study.cohort.cohort", "."), autoescape=True)
+    pages = jinja2.Environment(loader=jinja2.PackageLoader("vatsloc.study.cohort", "."), autoescape=True)
     page = pages.get_template("cohort.html").render(
         heads=_HEADS, rows=[(o, _cells(o)) for o in outcomes], summary=summary(outcomes), report=REPORT
     )
