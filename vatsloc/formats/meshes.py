@@ -87,6 +87,16 @@ def write_stl(path: Path, points_ras: Array, triangles: Array) -> None:
     path.write_bytes(header + records.tobytes())
 
 
+_TEXT_TRIANGLE = (
+    ([b"facet", b"normal"], 3),
+    ([b"outer", b"loop"], 0),
+    *(([b"vertex"], 3),) * 3,
+    ([b"endloop"], 0),
+    ([b"endfacet"], 0),
+)
+"""Lines of one triangle in a text STL: their words, and how many numbers follow."""
+
+
 @guarded("STL surface")
 def read_surface(path: Path) -> Surface:
     """Surface of an .stl, or points of a .mrk.json or .fcsv where a surface is expected.
@@ -112,16 +122,16 @@ def read_surface(path: Path) -> Surface:
 
 
 def _check_text_stl(path: Path) -> None:
-    """Refuse a text STL in which a corner has not three coordinates: meshio would take the first three."""
+    """Refuse a text STL whose lines are not those of whole triangles: meshio would skip or cut what it does not know."""
     text = path.read_bytes()
     if not text.lstrip().startswith(b"solid") or b"facet" not in text:
         return
-    for number, line in enumerate(text.splitlines(), 1):
-        words = line.split()
-        if words[:1] == [b"vertex"] and len(words) != 4:
-            raise InputRefused(
-                f"{path}, line {number}: a corner has {len(words) - 1} coordinates, 3 needed; export it again."
-            )
+    lines = [(number, line.split()) for number, line in enumerate(text.splitlines(), 1) if line.split()][1:-1]
+    for n, (number, words) in enumerate(lines):
+        kind, count = _TEXT_TRIANGLE[n % len(_TEXT_TRIANGLE)]
+        if words[: len(kind)] != kind or len(words) != len(kind) + count:
+            wanted = " ".join(word.decode() for word in kind) + (f" and {count} numbers" if count else "")
+            raise InputRefused(f"{path}, line {number}: {wanted} expected; export the surface again.")
 
 
 def _flip_vectors(values: Array) -> Array:
