@@ -122,7 +122,7 @@ def read_surface(path: Path) -> Surface:
 
 
 def _check_text_stl(path: Path) -> None:
-    """Refuse a text STL whose lines are not those of whole triangles: meshio would skip or cut what it does not know."""
+    """Refuse a text STL whose lines are not those of whole triangles, which meshio would skip or cut."""
     text = path.read_bytes()
     if not text.lstrip().startswith(b"solid") or b"facet" not in text:
         return
