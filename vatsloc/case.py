@@ -102,14 +102,16 @@ def read_case(folder: Path) -> Case:
     return Case(**{**known, "cbct_inflated": images["cbct_inflated"], "cbct_deflated": images["cbct_deflated"]})
 
 
-def read_case_before(folder: Path) -> CaseBefore:
+def read_case_before(folder: Path, wanted: tuple[str, ...] = ("ct", "cbct_inflated")) -> CaseBefore:
     """What there is of a case before the lung is collapsed: the CT, and the inflated scan once its file is there.
 
-    Raises as `read_case`, and InputRefused where neither case.toml nor the nodule tells the side.
+    wanted: of these the ones to read. Raises as `read_case`, and InputRefused where neither case.toml nor the nodule
+    tells the side.
     """
     file = read_case_file(folder)
     inflated = file.images.cbct_inflated
-    taken = ("ct",) if inflated is None or not (folder / inflated).exists() else ("ct", "cbct_inflated")
+    there = ("ct",) if inflated is None or not (folder / inflated).exists() else ("ct", "cbct_inflated")
+    taken = tuple(name for name in wanted if name in there)
     read = _read(folder, file, taken)
     side = nodule_side(read.images["ct"], read.nodule.mask, read.nodule.centre_ras)
     told = read.side or (None if side is None else (side, "nodule"))

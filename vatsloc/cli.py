@@ -84,6 +84,39 @@ def prepare(
 
 
 @app.command()
+def foresee(
+    case: CaseArgument,
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the forecast, whole or not at all.")],
+    as_json: JsonOption = False,
+) -> None:
+    """Forecast from the CT of CASE alone, before surgery, where the nodule will probably be when the lung is down."""
+    from vatsloc.workflow.foresee import foresee_case
+
+    told = foresee_case(case, out, say)
+    if as_json:
+        show(told)
+    else:
+        x, y, z = told["nodule_lps"]
+        a, b, c = told["nodule_ellipsoid95_mm"]
+        print(
+            f"forecast: nodule at LPS {x:.0f} {y:.0f} {z:.0f} mm in the CT's frame, give or take {a:.0f}, {b:.0f}, "
+            f"{c:.0f} mm (95 %); report: {out / 'report.html'}"
+        )
+
+
+@app.command("calibrate-forecast")
+def calibrate_forecast(
+    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="JSON file of the persons; a rerun goes on.")],
+    persons: Annotated[int, typer.Option(metavar="N", min=5, help="Phantoms that are moved.")] = 36,
+) -> None:
+    """Move phantoms by their physics, and write what `foresee` forecasts from."""
+    from vatsloc.study.forecast import calibrate
+
+    calibrate(out, persons, say)
+    print(out)
+
+
+@app.command()
 def new(
     case: Annotated[Path, typer.Argument(metavar="CASE", help="Case folder to make; nothing is overwritten.")],
     ct: Annotated[Path, typer.Option("--ct", metavar="PATH", help="CT: file, or folder of DICOM slices.")],

@@ -18,6 +18,8 @@ SURFACE = "#56B4E9"
 LUNG = "#E69F00"
 MESH = "#CC79A7"
 
+WINDOW_HU = (-1000.0, 250.0)
+
 
 @dataclass(frozen=True)
 class Outline:
@@ -116,7 +118,7 @@ class ReportData:
     nearest_surface_ras: Array | None = None
     landmarks: tuple[Landmark, ...] = ()
     motion: Motion | None = None
-    window_hu: tuple[float, float] = (-1000.0, 250.0)
+    window_hu: tuple[float, float] = WINDOW_HU
 
 
 @dataclass(frozen=True)

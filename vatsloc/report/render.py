@@ -15,7 +15,18 @@ from markupsafe import Markup
 from registration.volume import Array, Grid
 from vatsloc.frames import flip_points
 from vatsloc.report.charts import bars, box_plot
-from vatsloc.report.data import LUNG, MESH, NODULE, SURFACE, Comparison, Picture, ReportData, TreSection
+from vatsloc.report.data import (
+    LUNG,
+    MESH,
+    NODULE,
+    SURFACE,
+    WINDOW_HU,
+    Comparison,
+    Nodule,
+    Picture,
+    ReportData,
+    TreSection,
+)
 from vatsloc.report.landmarks import moved_by
 from vatsloc.report.paint import as_bgr, draw_nodule, draw_outline, green_magenta, grey, jpeg
 from vatsloc.report.planes import AXES, EDGE_LETTERS, Plane, box_of, plane_through, sample
@@ -105,6 +116,19 @@ def write_report(path: Path, data: ReportData) -> None:
     path.write_text(render(data), encoding="utf-8")
 
 
+def write_forecast(path: Path, name: str, told: Mapping[str, Any], picture: Picture, nodule: Nodule) -> None:
+    """Write the page of a forecast (UTF-8). told: what foresee.json holds; picture: the CT with the lung."""
+    page = _page("forecast.html").render(
+        name=name,
+        told=told,
+        title=picture.title,
+        outlines=picture.outlines,
+        colour=NODULE,
+        views=_views(picture, WINDOW_HU, nodule),
+    )
+    path.write_text(page, encoding="utf-8")
+
+
 def with_scores(page: str, scores: TreSection) -> str:
     """A rendered page with its scores filled in, or filled in anew. Raises ValueError when it has no place for them."""
     head, found, rest = page.partition(SCORES_FROM)
@@ -155,12 +179,14 @@ def _before_after(phase: Comparison, window: tuple[float, float]) -> list[tuple[
     return rows
 
 
-def _views(picture: Picture, window: tuple[float, float]) -> list[View]:
+def _views(picture: Picture, window: tuple[float, float], nodule: Nodule | None = None) -> list[View]:
     views = []
     for plane in _planes(picture.image.grid, picture.at_ras):
         image = as_bgr(grey(sample(picture.image, plane), window))
         for outline in picture.outlines:
             draw_outline(image, plane, outline)
+        if nodule is not None:
+            draw_nodule(image, plane, nodule)
         views.append(_view(image, f"{picture.title}: {plane.name} plane", plane))
     return views
 

@@ -64,6 +64,14 @@ def prepare_before(
 
 def prepare_ct(case: CaseBefore, stages: Stages) -> PreparedCt:
     """The part of `prepare` that needs the CT alone."""
+    lungs = prepare_lungs(case, stages)
+    with stages.stage("spines", CT):
+        spine = segment_spine(case.ct)
+    return PreparedCt(lungs, lungs.of(case.side), spine)
+
+
+def prepare_lungs(case: CaseBefore, stages: Stages) -> Lungs:
+    """The CT's lungs, the operated one as it was given by hand where it was."""
     with stages.stage("CT lungs", CT):
         lungs = segment_lungs(case.ct, case.side, case.nodule.mask, case.nodule.centre_ras)
     hinted = case.hints.lung_mask_ct
@@ -72,9 +80,7 @@ def prepare_ct(case: CaseBefore, stages: Stages) -> PreparedCt:
         for sentence in said:
             stages.warn(sentence)
         lungs = replace(lungs, left=hinted) if case.side == "left" else replace(lungs, right=hinted)
-    with stages.stage("spines", CT):
-        spine = segment_spine(case.ct)
-    return PreparedCt(lungs, lungs.of(case.side), spine)
+    return lungs
 
 
 def _cbct(image: Volume, name: str, stages: Stages) -> tuple[PreparedCbct, Spine]:

@@ -1,0 +1,85 @@
+"""Calibrates the forecast of a collapse (vatsloc/workflow/forecast.py) by phantoms that are moved, but never imaged.
+
+Their persons and collapses are drawn anew, over the ranges of the suite's; the suite itself takes no part.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from phantoms.spec import Collapse, PhantomSpec
+from phantoms.states import make_states
+from phantoms.thorax import draw_thorax
+from registration.volume import Array
+from vatsloc.formats.folder import write_whole
+from vatsloc.workflow.stages import Say, quiet
+
+FIRST_SEED = 3000
+"""Seeds of the suite and of what tests and studies draw lie below."""
+EVERY_CO2 = 3
+"""One person in so many is insufflated with carbon dioxide."""
+ELEMENT_MM = 18.0
+
+
+def drawn_spec(seed: int) -> PhantomSpec:
+    """A person's operation: every value drawn between the extremes of the suite's."""
+    rng = np.random.default_rng([seed, 21])
+    co2 = seed % EVERY_CO2 == 0
+    collapse = Collapse(
+        inflated=rng.uniform(0.85, 0.91),
+        deflated=rng.uniform(0.40, 0.64),
+        dome_rise=rng.uniform(-16.0, -12.0) if co2 else rng.uniform(3.0, 14.0),
+        shift=rng.uniform(11.0, 38.0),
+        gas="co2" if co2 else "air",
+        patchiness=rng.uniform(0.3, 1.0),
+        lobes_apart=rng.uniform(0.0, 0.1),
+    )
+    side, habitus = rng.choice(["right", "left"]), rng.choice(["average", "average", "obese"])
+    return PhantomSpec(
+        f"forecast {seed}", str(side), str(habitus), element=ELEMENT_MM, fused=rng.uniform(0, 1), collapse=collapse
+    )
+
+
+def moved(seed: int) -> dict[str, Any]:
+    """One person's row: gas, and the best affine motion of the lung about its middle to either state against the spine,
+    with R counted towards the operated side; what is left over as a covariance, mm2.
+    """
+    spec = drawn_spec(seed)
+    patient = draw_thorax(spec.side, spec.habitus, spec.lesion, seed, spec.fused).patient
+    states, _, _ = make_states(patient, spec, np.random.default_rng([seed, 11]))
+    mirror = np.array([1.0 if spec.side == "right" else -1.0, 1, 1])
+    ct = states[0].samples[patient.lung.sample(states[0].samples) < 0]
+    about = (ct - ct.mean(axis=0)) * mirror
+    row: dict[str, Any] = {"seed": seed, "gas": spec.collapse.gas}
+    for name, state in zip(("inflated", "deflated"), states, strict=True):
+        row[name] = affine_motion(about, (state.lung_map(ct) - ct) * mirror)
+    return row
+
+
+def affine_motion(about: Array, motion: Array) -> dict[str, Any]:
+    """The affine map nearest to the motion (n, 3) of points (n, 3) about their middle, and what it leaves over."""
+    terms = np.column_stack([np.ones(len(about)), about])
+    best = np.linalg.lstsq(terms, motion, rcond=None)[0]
+    left = motion - terms @ best
+    return {"shift": best[0].tolist(), "gradient": best[1:].T.tolist(), "left": (left.T @ left / len(left)).tolist()}
+
+
+def calibrate(out: Path, persons: int, say: Say = quiet) -> None:
+    """Write the rows of so many persons to a JSON file; those that it holds are not made again."""
+    rows = json.loads(out.read_text(encoding="utf-8")) if out.exists() else []
+    for seed in range(FIRST_SEED + len(rows), FIRST_SEED + persons):
+        say(f"person {seed} ...")
+        rows.append(moved(seed))
+        write_whole(out, "[\n" + ",\n".join(json.dumps(_rounded(row)) for row in rows) + "\n]\n")
+
+
+def _rounded(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _rounded(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_rounded(item) for item in value]
+    return round(value, 5) if isinstance(value, float) else value
