@@ -208,7 +208,7 @@ def _near_spine(spine: Mask, points: Array, reach_mm: float = 30.0) -> Array:
     return np.asarray(squared <= reach_mm**2)
 
 
-@njit(cache=True, parallel=True, fastmath=True)
+@njit(cache=True, parallel=True)
 def _scores(voxels, base, target, values, scores):
     ni, nj, nk = voxels.shape
     rotations, n, _ = base.shape

@@ -25,12 +25,14 @@ from vatsloc.formats.images import files_behind, read_volume_and_warnings, state
 from vatsloc.formats.markups import PointList, read_points
 from vatsloc.formats.meshes import Surface
 from vatsloc.frames import reorient
-from vatsloc.imaging.cbct import prepare_cbct
+from vatsloc.imaging.cbct import PreparedCbct, prepare_cbct
 from vatsloc.imaging.greyvalues import Calibration
+from vatsloc.imaging.side import PleuralGas as ShownGas
 from vatsloc.imaging.side import nodule_side, pleural_gas
-from vatsloc.imaging.spine import segment_spine
+from vatsloc.imaging.spine import Spine, segment_spine
 from vatsloc.marks import AXES, Nodule, NoduleSource, inside_of, mask_on, one_point, read_hint_surface, read_nodule
 
+IMAGES = ("ct", "cbct_inflated", "cbct_deflated")
 MIN_OVERLAP = 0.2
 """Share of the smaller image's box that must lie inside the other; headers promise poses within about 10 cm."""
 IMAGE_MM = (60.0, 3000.0)
@@ -51,9 +53,9 @@ class Hints:
 class CaseBefore:
     """What is known of a case before its lung is collapsed.
 
-    side: of the operated lung; cbct_inflated: None where it was not taken (yet); gravity_ras: unit (3,) in the CBCT's
-    frame; input_sha256 and stored_axes: by name of the input; warnings: sentences for the report; calibration: what
-    made images HU, by name of those that were not; side_told_by: "case.toml", "nodule" or "pleural gas".
+    side: of the operated lung; cbct_inflated: None where it was not taken, or not yet; gravity_ras: unit (3,) in the
+    CBCT's frame; input_sha256 and stored_axes: by name of the input; warnings: sentences for the report; calibration:
+    what made images HU, by name of those that were not; side_told_by: "case.toml", "nodule" or "pleural gas".
     """
 
     folder: Path
@@ -75,8 +77,12 @@ class CaseBefore:
 class Case(CaseBefore):
     """Everything `localize` may know."""
 
-    cbct_inflated: Volume
     cbct_deflated: Volume
+
+    @property
+    def scans(self) -> tuple[str, ...]:
+        """Names of the images that it has."""
+        return tuple(name for name in IMAGES if getattr(self, name) is not None)
 
 
 @dataclass(frozen=True)
@@ -95,11 +101,12 @@ def read_case(folder: Path) -> Case:
 
     Raises CaseError for a wrong case file, InputRefused for inputs that cannot be trusted or do not belong together.
     """
-    read = _read(folder, read_case_file(folder), ("ct", "cbct_inflated", "cbct_deflated"))
-    images = read.images
-    side, told_by = read.side or told_side(images["ct"], images["cbct_inflated"], images["cbct_deflated"], read.nodule)
+    file = read_case_file(folder)
+    read = _read(folder, file, tuple(name for name in IMAGES if name != "cbct_inflated" or file.images.cbct_inflated))
+    images, inflated = read.images, read.images.get("cbct_inflated")
+    side, told_by = read.side or told_side(images["ct"], inflated, images["cbct_deflated"], read.nodule)
     known = _known(read, side, told_by)
-    return Case(**{**known, "cbct_inflated": images["cbct_inflated"], "cbct_deflated": images["cbct_deflated"]})
+    return Case(**known, cbct_inflated=inflated, cbct_deflated=images["cbct_deflated"])
 
 
 def read_case_before(folder: Path, wanted: tuple[str, ...] = ("ct", "cbct_inflated")) -> CaseBefore:
@@ -120,7 +127,7 @@ def read_case_before(folder: Path, wanted: tuple[str, ...] = ("ct", "cbct_inflat
             "The nodule's place in the CT does not tell the operated side, and no deflated CBCT is there to tell it; "
             'add side = "right" or side = "left" to case.toml.'
         )
-    return CaseBefore(**{**_known(read, *told), "cbct_inflated": read.images.get("cbct_inflated")})
+    return CaseBefore(**_known(read, *told), cbct_inflated=read.images.get("cbct_inflated"))
 
 
 @dataclass(frozen=True)
@@ -188,7 +195,7 @@ def _known(read: _Read, side: Side, told_by: str) -> dict[str, Any]:
     }
 
 
-def told_side(ct: Volume, inflated: Volume, deflated: Volume, nodule: Nodule) -> tuple[Side, str]:
+def told_side(ct: Volume, inflated: Volume | None, deflated: Volume, nodule: Nodule) -> tuple[Side, str]:
     """The operated side, and what told it: the lung that holds the nodule, else the pleural gas.
 
     Raises InputRefused where neither does; `prepare` refuses a nodule and gas that contradict each other.
@@ -196,15 +203,23 @@ def told_side(ct: Volume, inflated: Volume, deflated: Volume, nodule: Nodule) ->
     side = nodule_side(ct, nodule.mask, nodule.centre_ras)
     if side is not None:
         return side, "nodule"
-    before, after = prepare_cbct(inflated), prepare_cbct(deflated)
-    spines = (segment_spine(image.volume, image.field.usable) for image in (before, after))
-    side = pleural_gas(before, after, *spines).side
+    side = shown_gas(inflated, deflated).side
     if side is None:
         raise InputRefused(
             "Neither the nodule's place in the CT nor pleural gas in the deflated CBCT tells the operated side; "
             'add side = "right" or side = "left" to case.toml.'
         )
     return side, "pleural gas"
+
+
+def shown_gas(inflated: Volume | None, deflated: Volume) -> ShownGas:
+    """Pleural gas in cone-beam CTs as they come."""
+    return pleural_gas(None if inflated is None else _with_spine(inflated), _with_spine(deflated))
+
+
+def _with_spine(image: Volume) -> tuple[PreparedCbct, Spine]:
+    cbct = prepare_cbct(image)
+    return cbct, segment_spine(cbct.volume, cbct.field.usable)
 
 
 def read_landmarks(folder: Path) -> Landmarks:

@@ -10,13 +10,14 @@ from typing import Annotated, Literal
 
 import typer
 
-# Before numpy is first imported: a lung's fronts are too small to share, and waiting threads burn the other core.
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# Before numpy is first imported, whatever was set: a lung's fronts are too small to share, waiting threads burn the
+# other core, and sums that threads share round otherwise.
+os.environ["OPENBLAS_NUM_THREADS"] = "1"
 
 from vatsloc.errors import GateFailed, as_ours
 from vatsloc.phantom_command import phantom
 from vatsloc.study.commands import bench, stability
-from vatsloc.terminal import JsonOption, say, show
+from vatsloc.terminal import JsonOption, progress, say, show, show_line
 
 app = typer.Typer(
     add_completion=False,
@@ -48,13 +49,20 @@ def localize(
     settings: Annotated[Path | None, typer.Option(metavar="FILE", help="TOML file that overrides the preset.")] = None,
     state: Annotated[Path | None, typer.Option(metavar="STATE", help="What `vatsloc prepare` made of CASE.")] = None,
     as_json: JsonOption = False,
+    json_lines: Annotated[
+        bool, typer.Option("--json-lines", help="Print the answer as one line of JSON when it is known, then the end.")
+    ] = False,
 ) -> None:
     """Find the nodule of CASE in the deflated cone-beam CT."""
     from vatsloc.workflow.run import run_case
     from vatsloc.workflow.settings import load_settings
 
-    run = run_case(case, out, load_settings(preset, settings), say, state)
-    if as_json:
+    answered = (lambda answer: show_line({"event": "answer", **answer})) if json_lines else None
+    with progress() as tell:
+        run = run_case(case, out, load_settings(preset, settings), tell, state, answered)
+    if json_lines:
+        show_line({"event": "written", "folder": str(out), "seconds": run["seconds"]["total"]})
+    elif as_json:
         show(run)
     else:
         x, y, z = run["nodule_lps"]
@@ -120,11 +128,14 @@ def calibrate_forecast(
 def new(
     case: Annotated[Path, typer.Argument(metavar="CASE", help="Case folder to make; nothing is overwritten.")],
     ct: Annotated[Path, typer.Option("--ct", metavar="PATH", help="CT: file, or folder of DICOM slices.")],
-    inflated: Annotated[Path, typer.Option("--inflated", metavar="PATH", help="Cone-beam CT of the inflated lung.")],
     deflated: Annotated[Path, typer.Option("--deflated", metavar="PATH", help="Cone-beam CT of the collapsed lung.")],
     nodule: Annotated[
         str, typer.Option("--nodule", metavar="FILE|X,Y,Z", help="Mask or markup in the CT, or its centre in RAS mm.")
     ],
+    inflated: Annotated[
+        Path | None,
+        typer.Option("--inflated", metavar="PATH", help="Cone-beam CT of the inflated lung, if there is one."),
+    ] = None,
     lps: Annotated[bool, typer.Option("--lps", help="X,Y,Z is LPS, as 3D Slicer's files and DICOM have it.")] = False,
     copy: Annotated[bool, typer.Option("--copy", help="Copy the files; else they are linked.")] = False,
     as_json: JsonOption = False,

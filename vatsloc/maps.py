@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from poro.mesh import TetMesh, interpolate, locate
+from poro.mesh import TetMesh, interpolate, locate, rasterize
 from registration.maps.field import DisplacementField, sample_map
 from registration.maps.rigid import RigidTransform
 from registration.volume import Array, Grid, Mask
@@ -40,24 +40,22 @@ class MeshMap:
         return MeshMap(TetMesh(self.moved, self.mesh.tets), self.mesh.points, self.around.inverse())
 
 
-def sampled(mapping: MeshMap, grid: Grid, beyond: bool = True) -> DisplacementField:
+def sampled(mapping: MeshMap, grid: Grid, beyond_mm: float = np.inf) -> DisplacementField:
     """A mesh's map on voxels, (ni, nj, nk, 3) float32.
 
-    Outside the mesh a voxel moves relative to the rigid motion as the nearest voxel inside does, or not at all where
-    `beyond` is False; either is far cheaper than the nearest point of the surface.
+    Outside the mesh a voxel moves relative to the rigid motion as the nearest voxel inside does, up to `beyond_mm` from
+    that, and farther off not at all; either is far cheaper than the nearest point of the surface.
     """
     rigid = sample_map(mapping.around, grid).vectors
     box, cut = _box_of(mapping.mesh, grid)
-    found = locate(mapping.mesh, box.points().reshape(-1, 3), nearest=False)
     relative = np.zeros((*grid.shape, 3), dtype=np.float32)
-    relative[cut] = interpolate(found, mapping.relative).reshape(*box.shape, 3)
-    if beyond and found.inside.any():
+    relative[cut], inside = rasterize(mapping.mesh, mapping.relative, box.ijk_from_ras, box.shape)
+    if beyond_mm > 0 and inside.any():
         outside = np.ones(grid.shape, dtype=bool)
-        outside[cut] = ~found.inside.reshape(box.shape)
-        nearest = ndimage.distance_transform_edt(
-            outside, sampling=grid.spacing, return_distances=False, return_indices=True
-        )
+        outside[cut] = ~inside
+        far, nearest = ndimage.distance_transform_edt(outside, sampling=grid.spacing, return_indices=True)
         relative = relative[tuple(nearest)]
+        relative[far > beyond_mm] = 0
     return DisplacementField(rigid + relative, grid.ras_from_ijk)
 
 
@@ -65,7 +63,7 @@ def covered(mesh: TetMesh, grid: Grid) -> Mask:
     """Voxels whose centres lie in a mesh."""
     box, cut = _box_of(mesh, grid)
     inside = np.zeros(grid.shape, dtype=bool)
-    inside[cut] = locate(mesh, box.points().reshape(-1, 3), nearest=False).inside.reshape(box.shape)
+    inside[cut] = rasterize(mesh, np.zeros((len(mesh.points), 0)), box.ijk_from_ras, box.shape)[1]
     return Mask(inside, grid.ras_from_ijk)
 
 

@@ -6,22 +6,20 @@ import json
 import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from registration.volume import Array, Grid, Volume
-from vatsloc.case import Case, image_overlap, read_case
+from vatsloc.case import Case, image_overlap, read_case, shown_gas
 from vatsloc.errors import CaseError, InputRefused, VatslocError
 from vatsloc.formats.casefile import FILE_NAME
 from vatsloc.formats.folder import whole_folder
 from vatsloc.formats.images import files_behind
 from vatsloc.formats.markups import PointList, write_points
-from vatsloc.imaging.cbct import prepare_cbct
 from vatsloc.imaging.greyvalues import peaks
-from vatsloc.imaging.side import PleuralGas, pleural_gas
-from vatsloc.imaging.spine import segment_spine
 
 LONG_SUFFIXES = (".nii.gz", ".mrk.json", ".seg.nrrd")
 POINT_SUFFIXES = (".mrk.json", ".json", ".fcsv")
@@ -33,13 +31,14 @@ class Sources:
     """Where the parts of a new case lie. nodule: a file, or its centre as (3,) RAS mm."""
 
     ct: Path
-    cbct_inflated: Path
+    cbct_inflated: Path | None
     cbct_deflated: Path
     nodule: Path | Array
 
     def images(self) -> dict[str, Path]:
-        """The three images by name."""
-        return {"ct": self.ct, "cbct_inflated": self.cbct_inflated, "cbct_deflated": self.cbct_deflated}
+        """The images by name, two or three."""
+        given = {"ct": self.ct, "cbct_inflated": self.cbct_inflated, "cbct_deflated": self.cbct_deflated}
+        return {name: path for name, path in given.items() if path is not None}
 
 
 def nodule_source(text: str, lps: bool) -> Path | Array:
@@ -147,8 +146,8 @@ def _write_case_file(folder: Path, case: Case | None, names: Mapping[str, str], 
 
 
 def _told(case: Case) -> dict[str, Any]:
-    images = {"ct": case.ct, "cbct_inflated": case.cbct_inflated, "cbct_deflated": case.cbct_deflated}
-    gas = _gas(case)
+    images: dict[str, Volume] = {name: getattr(case, name) for name in case.scans}
+    gas = shown_gas(case.cbct_inflated, case.cbct_deflated)
     gas.require(case.side, case.side_told_by)
     return {
         "images": {name: _image(case, name, image) for name, image in images.items()},
@@ -160,11 +159,6 @@ def _told(case: Case) -> dict[str, Any]:
         "overlap": _overlaps({name: image.grid for name, image in images.items()}),
         "warnings": list(case.warnings),
     }
-
-
-def _gas(case: Case) -> PleuralGas:
-    before, after = prepare_cbct(case.cbct_inflated), prepare_cbct(case.cbct_deflated)
-    return pleural_gas(before, after, *(segment_spine(p.volume, p.field.usable) for p in (before, after)))
 
 
 def _image(case: Case, name: str, image: Volume) -> dict[str, Any]:
@@ -187,8 +181,7 @@ def _image(case: Case, name: str, image: Volume) -> dict[str, Any]:
 
 def _overlaps(grids: Mapping[str, Grid]) -> dict[str, float]:
     """Share of the smaller box of each pair inside the other."""
-    pairs = (("ct", "cbct_inflated"), ("ct", "cbct_deflated"), ("cbct_inflated", "cbct_deflated"))
-    return {f"{a} and {b}": round(image_overlap(grids[a], grids[b]), 3) for a, b in pairs}
+    return {f"{a} and {b}": round(image_overlap(grids[a], grids[b]), 3) for a, b in combinations(grids, 2)}
 
 
 def _in_given_words(sentence: str, partial: Path, folder: Path, given: Mapping[str, Path]) -> str:

@@ -40,10 +40,23 @@ RIGID_CT_FROM_INFLATED = "from-CBCTinflated_to-CT_mode-image_desc-rigid_xfm.tfm"
 RIGID_DEFLATED_FROM_INFLATED = "from-CBCTinflated_to-CBCTdeflated_mode-points_desc-rigid_xfm.tfm"
 RIGID_INFLATED_FROM_DEFLATED = "from-CBCTdeflated_to-CBCTinflated_mode-image_desc-rigid_xfm.tfm"
 REPORT, SCENE, SCENE_WITH_SCANS = "report.html", "scene.mrml", "scene_with_scans.mrml"
+ANSWER = "answer.json"
+ANSWERED = (
+    "program",
+    "status",
+    "nodule_lps",
+    "nodule_ellipsoid95_mm",
+    "nodule_ellipsoid95_axes_lps",
+    "gates",
+    "warnings",
+    "scans",
+)
+"""Keys of run.json that it holds."""
 RADIUS95 = "radius95_mm"
 """Of the nodes of `LUNG_DEFLATED`: how far off the tissue there may be, 95 %."""
 
 OUTPUT_FILES = (
+    ANSWER,
     NODULE_INFLATED,
     NODULE_DEFLATED,
     NODULE_MASK,
@@ -68,6 +81,31 @@ OUTPUT_FILES = (
     SCENE_WITH_SCANS,
 )
 """What a finished results folder holds; report and scenes are written by modules of their own into the same folder."""
+
+
+OF_INFLATED = (
+    NODULE_INFLATED,
+    CT_IN_INFLATED,
+    LUNG_INFLATED,
+    INFLATED_FROM_CT,
+    CT_FROM_INFLATED,
+    RIGID_INFLATED_FROM_CT,
+    RIGID_CT_FROM_INFLATED,
+    RIGID_DEFLATED_FROM_INFLATED,
+    RIGID_INFLATED_FROM_DEFLATED,
+)
+"""Those that a result without an inflated scan does not have."""
+RIGID_DEFLATED_FROM_CT = "from-CT_to-CBCTdeflated_mode-points_desc-rigid_xfm.tfm"
+RIGID_CT_FROM_DEFLATED = "from-CBCTdeflated_to-CT_mode-image_desc-rigid_xfm.tfm"
+"""Those that it has instead."""
+
+
+def output_files(inflated: bool) -> tuple[str, ...]:
+    """What a finished results folder holds, with or without an inflated scan."""
+    if inflated:
+        return OUTPUT_FILES
+    kept = tuple(name for name in OUTPUT_FILES if name not in OF_INFLATED)
+    return (*kept, RIGID_DEFLATED_FROM_CT, RIGID_CT_FROM_DEFLATED)
 
 
 @dataclass(frozen=True)
@@ -104,21 +142,23 @@ class ResultData:
     nodule_*_ras: (3,); nodule_mask_deflated and ct_in_*: on the grids of the CBCTs; lung_*: the same tetrahedra in
     three shapes; inflated_from_ct, deflated_from_ct: on (a part of) the CT's grid; ct_from_*: on those of the CBCTs;
     rigid_*: (4, 4); stored_axes: voxel axis letters of the input files ("ct", "cbct_inflated", "cbct_deflated").
+    Without an inflated scan its images and fields are None, and what else is called inflated is what stood in for it,
+    in the CT's frame.
     """
 
     nodule_inflated_ras: Array
     nodule_deflated_ras: Array
     nodule_mask_deflated: Mask
-    ct_in_inflated: Volume
+    ct_in_inflated: Volume | None
     ct_in_deflated: Volume
     lung_ct: TetraMesh
     lung_inflated: TetraMesh
     lung_deflated: TetraMesh
     deflated_surface: Surface
     contact_surface: Surface
-    inflated_from_ct: DisplacementField
+    inflated_from_ct: DisplacementField | None
     deflated_from_ct: DisplacementField
-    ct_from_inflated: DisplacementField
+    ct_from_inflated: DisplacementField | None
     ct_from_deflated: DisplacementField
     rigid_inflated_from_ct: Array
     rigid_deflated_from_inflated: Array
@@ -129,23 +169,44 @@ class ResultData:
 def write_results(folder: Path, data: ResultData) -> None:
     """Write every output file but report and scenes into an existing folder, two files at a time."""
     axes = data.stored_axes
-    inflated, deflated = axes["cbct_inflated"], axes["cbct_deflated"]
+    deflated = axes["cbct_deflated"]
     writes: list[Callable[[], None]] = [
-        lambda: write_field(folder / INFLATED_FROM_CT, data.inflated_from_ct, axes["ct"]),
+        *_writes_of_inflated(folder, data),
         lambda: write_field(folder / DEFLATED_FROM_CT, data.deflated_from_ct, axes["ct"]),
-        lambda: write_field(folder / CT_FROM_INFLATED, data.ct_from_inflated, inflated),
         lambda: write_field(folder / CT_FROM_DEFLATED, data.ct_from_deflated, deflated),
-        lambda: write_volume(folder / CT_IN_INFLATED, data.ct_in_inflated, inflated),
         lambda: write_volume(folder / CT_IN_DEFLATED, data.ct_in_deflated, deflated),
         lambda: write_mask(folder / NODULE_MASK, data.nodule_mask_deflated, deflated),
         lambda: write_vtu(folder / LUNG_CT, data.lung_ct),
-        lambda: write_vtu(folder / LUNG_INFLATED, data.lung_inflated),
         lambda: write_vtu(folder / LUNG_DEFLATED, data.lung_deflated),
         lambda: _write_small_files(folder, data),
     ]
     with ThreadPoolExecutor(max_workers=2) as pool:  # compression releases the interpreter lock
         for written in [pool.submit(write) for write in writes]:
             written.result()
+
+
+def write_answer(folder: Path, run: RunRecord, nodule_deflated_ras: Array) -> dict[str, Any]:
+    """Write the position and what says whether to trust it, which a run knows first; return what answer.json holds."""
+    told = run.as_json()
+    answer = {key: told[key] for key in ANSWERED if key in told}
+    (folder / ANSWER).write_text(json.dumps(answer, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    point = PointList(np.reshape(nodule_deflated_ras, (1, 3)), ("nodule",), ("predicted centre",))
+    write_points(folder / NODULE_DEFLATED, point)
+    return answer
+
+
+def _writes_of_inflated(folder: Path, data: ResultData) -> list[Callable[[], None]]:
+    """What is written of the inflated scan, nothing where there was none."""
+    from_ct, to_ct, image = data.inflated_from_ct, data.ct_from_inflated, data.ct_in_inflated
+    if from_ct is None or to_ct is None or image is None:
+        return []
+    axes = data.stored_axes["cbct_inflated"]
+    return [
+        lambda: write_field(folder / INFLATED_FROM_CT, from_ct, data.stored_axes["ct"]),
+        lambda: write_field(folder / CT_FROM_INFLATED, to_ct, axes),
+        lambda: write_volume(folder / CT_IN_INFLATED, image, axes),
+        lambda: write_vtu(folder / LUNG_INFLATED, data.lung_inflated),
+    ]
 
 
 def read_run(folder: Path) -> dict[str, Any]:
@@ -172,18 +233,24 @@ def source_digest() -> str:
 
 
 def _write_small_files(folder: Path, data: ResultData) -> None:
-    for name, point in ((NODULE_INFLATED, data.nodule_inflated_ras), (NODULE_DEFLATED, data.nodule_deflated_ras)):
-        write_points(folder / name, PointList(np.reshape(point, (1, 3)), ("nodule",), ("predicted centre",)))
+    inflated = data.ct_in_inflated is not None
+    write_answer(folder, data.run, data.nodule_deflated_ras)
+    if inflated:
+        point = PointList(np.reshape(data.nodule_inflated_ras, (1, 3)), ("nodule",), ("predicted centre",))
+        write_points(folder / NODULE_INFLATED, point)
     if not np.allclose(flip_points(data.nodule_deflated_ras), data.run.nodule_lps, atol=1e-6):
         raise ValueError(
             f"run says nodule_lps {data.run.nodule_lps}, the result {flip_points(data.nodule_deflated_ras)}"
         )
     write_stl(folder / DEFLATED_STL, data.deflated_surface.points_ras, data.deflated_surface.triangles)
     write_stl(folder / CONTACT_STL, data.contact_surface.points_ras, data.contact_surface.triangles)
-    for rigid, forth, back in (
-        (data.rigid_inflated_from_ct, RIGID_INFLATED_FROM_CT, RIGID_CT_FROM_INFLATED),
-        (data.rigid_deflated_from_inflated, RIGID_DEFLATED_FROM_INFLATED, RIGID_INFLATED_FROM_DEFLATED),
-    ):
+    rigids = [(data.rigid_deflated_from_inflated, RIGID_DEFLATED_FROM_CT, RIGID_CT_FROM_DEFLATED)]
+    if inflated:
+        rigids = [
+            (data.rigid_inflated_from_ct, RIGID_INFLATED_FROM_CT, RIGID_CT_FROM_INFLATED),
+            (data.rigid_deflated_from_inflated, RIGID_DEFLATED_FROM_INFLATED, RIGID_INFLATED_FROM_DEFLATED),
+        ]
+    for rigid, forth, back in rigids:
         write_tfm(folder / forth, rigid)
         write_tfm(folder / back, np.linalg.inv(rigid))
     text = json.dumps(data.run.as_json(), indent=1, allow_nan=False)

@@ -45,19 +45,31 @@ def write_result_scenes(partial: Path, case: Path, folder: Path, data: ResultDat
 
 def _own(folder: Path, data: ResultData) -> list[Item]:
     """What lies in the result itself."""
+    if data.ct_in_inflated is None:
+        return [
+            Frame(CT, data.rigid_deflated_from_inflated),
+            *_of_deflated(folder),
+            FieldFile("CT to deflated CBCT", folder / CT_FROM_DEFLATED),
+        ]
     return [
         Frame(INFLATED, data.rigid_deflated_from_inflated),
         Frame(CT, data.rigid_inflated_from_ct, INFLATED),
-        VolumeFile("CT warped to the deflated CBCT", folder / CT_IN_DEFLATED),
         VolumeFile("CT warped to the inflated CBCT", folder / CT_IN_INFLATED, INFLATED),
-        VolumeFile("nodule", folder / NODULE_MASK, label=True),
-        ModelFile("deflated lung", folder / DEFLATED_STL, LUNG, 0.4),
-        ModelFile("chest wall", folder / CONTACT_STL, GREY, 0.15),
+        *_of_deflated(folder),
         ModelFile("inflated lung", folder / LUNG_INFLATED, SURFACE, 0.3, visible=False, frame=INFLATED),
-        PointsFile("nodule, deflated", folder / NODULE_DEFLATED, NODULE),
         PointsFile("nodule, inflated", folder / NODULE_INFLATED, SURFACE, INFLATED),
         FieldFile("CT to inflated CBCT", folder / CT_FROM_INFLATED),
         FieldFile("CT to deflated CBCT", folder / CT_FROM_DEFLATED),
+    ]
+
+
+def _of_deflated(folder: Path) -> list[Item]:
+    return [
+        VolumeFile("CT warped to the deflated CBCT", folder / CT_IN_DEFLATED),
+        VolumeFile("nodule", folder / NODULE_MASK, label=True),
+        ModelFile("deflated lung", folder / DEFLATED_STL, LUNG, 0.4),
+        ModelFile("chest wall", folder / CONTACT_STL, GREY, 0.15),
+        PointsFile("nodule, deflated", folder / NODULE_DEFLATED, NODULE),
     ]
 
 

@@ -1,12 +1,13 @@
 """Tetrahedral meshes of a lung: how a mask is filled, its surface and patches, quality, and where points lie.
 
-`stuff` fills a mask with tetrahedra (`TetMesh`), `locate` and `interpolate` carry nodal fields to points, and
-`closest_points` measures distances from a surface (`TriSurface`).
+`stuff` fills a mask with tetrahedra (`TetMesh`), `locate` and `interpolate` carry nodal fields to points,
+`rasterize` to voxels, and `closest_points` measures distances from a surface (`TriSurface`).
 """
 
 from poro.mesh.closest import closest_points
 from poro.mesh.locate import interpolate, locate
-from poro.mesh.patches import patches, principal_axis
+from poro.mesh.patches import patches
+from poro.mesh.rasterize import rasterize
 from poro.mesh.stuffing import signed_distance, stuff, stuff_level_set
 from poro.mesh.tetmesh import TetMesh, TriSurface, quality, surface
 
@@ -17,8 +18,8 @@ __all__ = [
     "interpolate",
     "locate",
     "patches",
-    "principal_axis",
     "quality",
+    "rasterize",
     "signed_distance",
     "stuff",
     "stuff_level_set",

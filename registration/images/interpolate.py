@@ -23,7 +23,7 @@ class _Samples(NamedTuple):
     gradient: Array
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True)
 def _values(voxels, points, fill, out, start, stop):
     ni, nj, nk = voxels.shape
     for n in range(start, stop):
@@ -43,7 +43,7 @@ def _values_threads(voxels, points, fill, out):
         _values(voxels, points, fill, out, n * c // CHUNKS, n * (c + 1) // CHUNKS)
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True)
 def _warp(voxels, base, displacement, index, ijk_from_ras, out, start, stop):
     ni, nj, nk = voxels.shape
     for n in range(start, stop):

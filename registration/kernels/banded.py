@@ -64,7 +64,7 @@ def along_axis(values: Array, axis: int, matrix: Banded) -> Array:
     return out.reshape(*s[:axis], rows, *s[axis + 1 :])
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True)
 def _inner_axis(values, first, weights, out, start, stop):
     rows, width = out.shape[1], out.shape[2]
     taps = weights.shape[1]
@@ -78,7 +78,7 @@ def _inner_axis(values, first, weights, out, start, stop):
                 out[p, r, q] += w * values[p, first[r] + k, q]
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True)
 def _last_axis(values, first, weights, out, start, stop):
     rows, taps = weights.shape
     for p in range(start, stop):

@@ -16,7 +16,7 @@ def box_sums(values: Array, radius: int) -> Array:
     return out
 
 
-@njit(cache=True, parallel=True, fastmath=True)
+@njit(cache=True, parallel=True)
 def _sum_in_planes(values, radius, out):
     nq, ni, nj, nk = values.shape
     for t in prange(nq * ni):
@@ -42,7 +42,7 @@ def _sum_in_planes(values, radius, out):
             out[t // ni, t % ni, j] = run_j
 
 
-@njit(cache=True, parallel=True, fastmath=True)
+@njit(cache=True, parallel=True)
 def _sum_across_planes(values, radius):
     nq, ni, nj, nk = values.shape
     for t in prange(nq * nj):

@@ -110,14 +110,14 @@ class LocalNcc:
         w, m = w.astype(f.dtype), (m - m.mean()).astype(f.dtype)
         sums = _MovingSums(*self._window_sums(w * m, w * m * m, w * f * m))
         scaled = w * f.dtype.type(1 / max(float(w.sum(dtype=np.float64)), 1e-3))
-        parts = np.empty((4, len(f)), dtype=f.dtype)
-        cc = _correlations(scaled, self._fixed_sums, sums, f.dtype.type(self.floor**2), parts)
+        parts, cc = np.empty((4, len(f)), dtype=f.dtype), np.empty_like(f)
+        _correlations(scaled, self._fixed_sums, sums, f.dtype.type(self.floor**2), parts, cc)
 
         def derive() -> tuple[Array, Array]:
             sa, sb, sab, sh = self._window_sums(*parts)
             return -w * (f * sa - m * sb - sab), w * sh
 
-        return Dissimilarity(1 - float(cc), derive)
+        return Dissimilarity(1 - float(cc.sum(dtype=np.float64)), derive)
 
     def _window_sums(self, *values: Array) -> list[Array]:
         """Sums over each sample's window of values given at the samples, (n,) each."""
@@ -129,23 +129,22 @@ class LocalNcc:
 
 
 @njit(cache=True, parallel=True)
-def _correlations(w, fixed, moving, noise, parts):
-    """Sum of the correlation coefficients weighted by w (n,); fills parts (4, n), of which their derivatives are made.
+def _correlations(w, fixed, moving, noise, parts, cc):
+    """Fill cc (n,) with the correlation coefficients weighted by w (n,), and parts (4, n), of which their derivatives
+    are made.
 
-    An array in a named tuple must not be filled here: numba takes a parallel loop's writes to it for dead code.
+    They are summed elsewhere: a parallel loop's sum depends on the number of threads. An array in a named tuple must
+    not be filled here: numba takes a parallel loop's writes to it for dead code.
     """
     n, sf, sff = fixed.n, fixed.f, fixed.ff
     sm, smm, sfm = moving.m, moving.mm, moving.fm
-    total = 0.0
     for p in prange(len(w)):
         count = max(n[p], 1e-3)
         mean_f, mean_m = sf[p] / count, sm[p] / count
         vf = max(sff[p] - sf[p] * mean_f, 0.0) + count * noise
         vm = max(smm[p] - sm[p] * mean_m, 0.0) + count * noise
         parts[0, p] = w[p] / np.sqrt(vf * vm)
-        cc = (sfm[p] - sf[p] * mean_m) * parts[0, p]
-        parts[1, p] = cc / vm
+        cc[p] = (sfm[p] - sf[p] * mean_m) * parts[0, p]
+        parts[1, p] = cc[p] / vm
         parts[2, p] = parts[0, p] * mean_f - parts[1, p] * mean_m
         parts[3, p] = w[p] / vm
-        total += cc
-    return total

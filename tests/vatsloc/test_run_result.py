@@ -15,10 +15,11 @@ from vatsloc.maps import covered
 from vatsloc.report.data import LUNG, SURFACE
 from vatsloc.results import ResultData
 from vatsloc.workflow.choices import Choice
+from vatsloc.workflow.fields import fields_of
 from vatsloc.workflow.gates import Gate
 from vatsloc.workflow.localization import Localization
 from vatsloc.workflow.model_selection import Refinement
-from vatsloc.workflow.run import _fields, _nodule_mask, _pictures, _record, _residuals, _result
+from vatsloc.workflow.run import _nodule_mask, _pictures, _record, _residuals, _result
 from vatsloc.workflow.settings import Settings
 from vatsloc.workflow.stages import Stages
 
@@ -42,7 +43,7 @@ def found() -> Localization:
 @pytest.fixture(scope="module")
 def result(found: Localization) -> ResultData:
     case = known.scene().case
-    return _result(case, found, _fields(case, found), _record(case, found, Settings(), stages()))
+    return _result(case, found, fields_of(case, found, 0.0), _record(case, found, Settings(), stages()))
 
 
 def stages() -> Stages:

@@ -69,7 +69,7 @@ def test_sampled_map_agrees_with_the_map(squeeze: MeshMap) -> None:
     field = sampled(squeeze, grid)
     points = grid.points()[inside]
     np.testing.assert_allclose(points + field.vectors[inside], squeeze(points), atol=1e-4)
-    still = sampled(squeeze, grid, beyond=False)
+    still = sampled(squeeze, grid, 0.0)
     outside = grid.points()[~inside]
     np.testing.assert_allclose(outside + still.vectors[~inside], AROUND(outside), atol=1e-4)
 

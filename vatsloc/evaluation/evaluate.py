@@ -77,10 +77,17 @@ def evaluate(truth: Truth, result: Result) -> Evaluation:
     errors = target_registration_errors(landmarks, result.maps)
     depth = depth_below_pleura(result.lung_ct, landmarks.ct)
     seen = {"inflated": landmarks.inflated, "deflated": landmarks.deflated}
-    inside_fov = np.logical_and.reduce([seen_in(truth.fields_of_view[image], points) for image, points in seen.items()])
+    inside_fov = np.logical_and.reduce(
+        [
+            seen_in(truth.fields_of_view[image], points)
+            for image, points in seen.items()
+            if image in truth.fields_of_view
+        ]
+    )
     inside_mesh = depth >= 0
-    inflated = np.isfinite(landmarks.inflated).all(axis=1)
-    inside_mesh[inflated] &= locate(result.lung_inflated, landmarks.inflated[inflated]).inside
+    if result.lung_inflated is not None:
+        inflated = np.isfinite(landmarks.inflated).all(axis=1)
+        inside_mesh[inflated] &= locate(result.lung_inflated, landmarks.inflated[inflated]).inside
     grid = result.field.grid
     ijk = grid.to_ijk(landmarks.ct)
     inside_field = np.all((ijk >= -0.5) & (ijk <= np.array(grid.shape) - 0.5), axis=1)
@@ -142,7 +149,9 @@ def _dense(points: Array, truth: Truth, result: Result) -> tuple[dict[str, Any],
     both cone-beam CTs show and the others; of the former also by depth below the pleura.
     """
     ct, inflated, deflated = points[:, 0], points[:, 1], points[:, 2]
-    seen = seen_in(truth.fields_of_view["inflated"], inflated) & seen_in(truth.fields_of_view["deflated"], deflated)
+    seen = seen_in(truth.fields_of_view["deflated"], deflated)
+    if "inflated" in truth.fields_of_view:
+        seen &= seen_in(truth.fields_of_view["inflated"], inflated)
     errors = {
         "phase1": distances(result.maps.inf_from_ct(ct), inflated),
         "chain": distances(result.maps.def_from_ct(ct), deflated),
@@ -190,6 +199,8 @@ def _held(errors_mm: Array, radius_mm: Array) -> dict[str, Any]:
 def _nodule(truth: Truth, result: Result) -> dict[str, Any]:
     """Distance of both predicted nodules to the truth, None where that is not known."""
     inf, deflated = truth.nodule.nodule_inflated_ras, truth.nodule.nodule_deflated_ras
+    if result.nodule_inflated_ras is None:
+        inf = None
     contained, semi_axes = None, result.run.get("nodule_ellipsoid95_mm")
     if deflated is not None and semi_axes is not None and None not in semi_axes:
         offset = flip_points(deflated - result.nodule_deflated_ras)

@@ -35,6 +35,7 @@ from vatsloc.results import (
     NODULE_DEFLATED,
     NODULE_INFLATED,
     RADIUS95,
+    RIGID_DEFLATED_FROM_CT,
     RIGID_DEFLATED_FROM_INFLATED,
     RIGID_INFLATED_FROM_CT,
     read_run,
@@ -52,15 +53,16 @@ class Result:
     """A results folder in memory.
 
     run: run.json; lung_ct: for depths; nodule_*_ras: (3,) predictions, RAS mm; radius95_mm: (n,) at the lungs' nodes,
-    how far off the run holds its tissue to be at most (95 %), None in results from before it was written.
+    how far off the run holds its tissue to be at most (95 %), None in results from before it was written. Without an
+    inflated scan what belongs to it is None, and its maps are defined nowhere.
     """
 
     run: dict[str, Any]
     maps: RunMaps
     field: DisplacementField
     lung_ct: TetMesh
-    lung_inflated: TetMesh
-    nodule_inflated_ras: Array
+    lung_inflated: TetMesh | None
+    nodule_inflated_ras: Array | None
     nodule_deflated_ras: Array
     radius95_mm: Array | None = None
 
@@ -153,6 +155,8 @@ def read_result(folder: Path) -> Result:
 def _result(folder: Path) -> Result:
     run = read_run(folder)
     _check_record(run)
+    if "cbct_inflated" not in run.get("scans", ("cbct_inflated",)):
+        return _without_inflated(folder, run)
     ct, inflated, deflated = (read_vtu(folder / name) for name in (LUNG_CT, LUNG_INFLATED, LUNG_DEFLATED))
     if not (np.array_equal(ct.tets, inflated.tets) and np.array_equal(inflated.tets, deflated.tets)):
         raise InputRefused(f"the lungs in {folder} have different tetrahedra; run localize again.")
@@ -179,6 +183,28 @@ def _result(folder: Path) -> Result:
         nodule_deflated_ras=read_points(folder / NODULE_DEFLATED).ras[0],
         radius95_mm=deflated.point_data.get(RADIUS95),
     )
+
+
+def _without_inflated(folder: Path, run: dict[str, Any]) -> Result:
+    ct, deflated = (read_vtu(folder / name) for name in (LUNG_CT, LUNG_DEFLATED))
+    if not np.array_equal(ct.tets, deflated.tets):
+        raise InputRefused(f"the lungs in {folder} have different tetrahedra; run localize again.")
+    def_from_ct, rigid = read_field(folder / DEFLATED_FROM_CT), _rigid(folder / RIGID_DEFLATED_FROM_CT)
+    return Result(
+        run=run,
+        maps=RunMaps(_nowhere, rigid, _nowhere, _nowhere, _nowhere, def_from_ct),
+        field=def_from_ct,
+        lung_ct=TetMesh(ct.points_ras, ct.tets),
+        lung_inflated=None,
+        nodule_inflated_ras=None,
+        nodule_deflated_ras=read_points(folder / NODULE_DEFLATED).ras[0],
+        radius95_mm=deflated.point_data.get(RADIUS95),
+    )
+
+
+def _nowhere(points: Array) -> Array:
+    """The map into a scan that was not taken."""
+    return np.full(points.shape, np.nan)
 
 
 def _check_record(run: dict[str, Any]) -> None:

@@ -64,11 +64,10 @@ class PleuralGas:
         }
 
 
-def pleural_gas(
-    inflated: PreparedCbct, deflated: PreparedCbct, spine_inflated: Spine, spine_deflated: Spine
-) -> PleuralGas:
-    """Gas beside the lungs before and after the collapse, parted by the spine."""
-    return PleuralGas(_gas_ml(inflated, spine_inflated), _gas_ml(deflated, spine_deflated))
+def pleural_gas(inflated: tuple[PreparedCbct, Spine] | None, deflated: tuple[PreparedCbct, Spine]) -> PleuralGas:
+    """Gas beside the lungs before and after the collapse, parted by the spine; none before it without a scan."""
+    none: dict[Side, float] = {"right": 0.0, "left": 0.0}
+    return PleuralGas(none if inflated is None else _gas_ml(*inflated), _gas_ml(*deflated))
 
 
 def nodule_side(ct: Volume, nodule: Mask | None, nodule_ras: Array | None) -> Side | None:

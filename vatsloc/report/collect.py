@@ -23,25 +23,33 @@ def report_data(case: Case, result: ResultData, pictures: tuple[Picture, ...] = 
     """
     inflated, deflated = _outer(result.lung_inflated), _outer(result.lung_deflated)
     nodule = Nodule(result.nodule_deflated_ras, _ellipsoid(result.run))
+    inflated_scan, ct_in_inflated = case.cbct_inflated, result.ct_in_inflated
+    first = (
+        ()
+        if inflated_scan is None or ct_in_inflated is None
+        else (
+            Comparison(
+                title="Phase 1: change of pose",
+                fixed_name="inflated CBCT",
+                fixed=inflated_scan,
+                before_name="CT",
+                before=case.ct,
+                before_from_fixed=RigidTransform(result.rigid_inflated_from_ct).inverse(),
+                after_name="warped CT",
+                after=ct_in_inflated,
+                nodule=Nodule(result.nodule_inflated_ras),
+                outlines=(Outline("lung model", LUNG, inflated),),
+            ),
+        )
+    )
     phases = (
+        *first,
         Comparison(
-            title="Phase 1: change of pose",
-            fixed_name="inflated CBCT",
-            fixed=case.cbct_inflated,
-            before_name="CT",
-            before=case.ct,
-            before_from_fixed=RigidTransform(result.rigid_inflated_from_ct).inverse(),
-            after_name="warped CT",
-            after=result.ct_in_inflated,
-            nodule=Nodule(result.nodule_inflated_ras),
-            outlines=(Outline("lung model", LUNG, inflated),),
-        ),
-        Comparison(
-            title="Phase 2: pneumothorax",
+            title="Phase 2: pneumothorax" if first else "CT to deflated CBCT",
             fixed_name="deflated CBCT",
             fixed=case.cbct_deflated,
-            before_name="inflated CBCT",
-            before=case.cbct_inflated,
+            before_name="CT" if inflated_scan is None else "inflated CBCT",
+            before=case.ct if inflated_scan is None else inflated_scan,
             before_from_fixed=RigidTransform(result.rigid_deflated_from_inflated).inverse(),
             after_name="warped CT",
             after=result.ct_in_deflated,

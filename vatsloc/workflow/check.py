@@ -32,14 +32,17 @@ MARGIN_MM = 40.0
 
 @dataclass(frozen=True)
 class Checks:
-    """What is left over of both parts of a result. phase1: CT to inflated CBCT; chain: CT to deflated CBCT."""
+    """What is left over of both parts of a result. phase1: CT to inflated CBCT, None without one; chain: CT to deflated
+    CBCT.
+    """
 
-    phase1: LeftOver
+    phase1: LeftOver | None
     chain: LeftOver
 
     def entry(self, nodule_inf: Array, nodule_def: Array) -> dict[str, Any]:
         """The keys of run.json, vectors in LPS. nodule_inf, nodule_def: (3,) RAS mm."""
-        return {"phase1": _entry(self.phase1, nodule_inf), "chain": _entry(self.chain, nodule_def)}
+        phase1 = None if self.phase1 is None else _entry(self.phase1, nodule_inf)
+        return {"phase1": phase1, "chain": _entry(self.chain, nodule_def)}
 
 
 def compare(ct: Volume, scan: PreparedCbct, lung: Mask, scan_from_ct: MeshMap) -> LeftOver:
@@ -65,6 +68,8 @@ def check_gates(checks: Checks, limits: GateSettings) -> dict[str, Gate]:
     """Gates on what is left over, and on whether enough is recognized to say so."""
     gates = {}
     for suffix, left in (("_phase1", checks.phase1), ("", checks.chain)):
+        if left is None:
+            continue
         scan = "inflated" if suffix else "deflated"
         gates[f"check{suffix}"] = at_most(
             worst_mm(left),

@@ -28,10 +28,11 @@ State = Literal["inflated", "deflated"]
 class Motions:
     """Motions of lungs against the spine, one per person, R counted towards the operated side.
 
-    shift: (m, 3) mm of the middle; gradient: (m, 3, 3) of the motion about it; left: (m, 3, 3) mm2, mean square of what
-    the affine motion leaves over.
+    gas: (m,) "air" or "co2"; shift: (m, 3) mm of the middle; gradient: (m, 3, 3) of the motion about it; left:
+    (m, 3, 3) mm2, mean square of what the affine motion leaves over.
     """
 
+    gas: Array
     shift: Array
     gradient: Array
     left: Array
@@ -43,7 +44,7 @@ class Motions:
 @dataclass(frozen=True)
 class Forecast:
     """centre: (3,) RAS mm in the CT's frame; semi_axes_mm: (3,) of the 95 % ellipsoid, longest first; axes: (3, 3),
-    their directions in rows; persons: how many it rests on.
+    their directions in rows; persons: how many with this gas in the chest it rests on.
     """
 
     centre: Array
@@ -52,21 +53,25 @@ class Forecast:
     persons: int
 
 
-def forecast(point: Array, middle: Array, side: Side, motions: Motions) -> Forecast:
+def forecast(point: Array, middle: Array, side: Side, motions: Motions, gas: PleuralGas = "air") -> Forecast:
     """Where a point (3,) of a lung with its middle (3,) goes, RAS mm. side: the operated one.
 
-    The ellipsoid is the prediction region of one more person of the same kind (Hotelling's T squared).
-    Raises ValueError for fewer than five persons.
+    The mean is that of the persons with this gas, the spread that of all about the mean of theirs; the ellipsoid is the
+    prediction region of one more person (Hotelling's T squared). Raises ValueError for fewer than five persons.
     """
-    n = len(motions)
+    own = motions.gas == gas
+    n = int(own.sum())
     if n < 5:
-        raise ValueError(f"the calibration holds {n} persons of this kind, 5 needed")
+        raise ValueError(f"the calibration holds {n} persons with {gas} in the chest, 5 needed")
     mirror = mirrored(side)
     about = (point - middle) * mirror
     guesses = motions.shift + motions.gradient @ about
-    mean = guesses.mean(axis=0)
-    spread = np.cov(guesses.T) + motions.left.mean(axis=0)
-    reach = (n + 1) / n * 3 * (n - 1) / (n - 3) * stats.f.ppf(0.95, 3, n - 3)
+    mean = guesses[own].mean(axis=0)
+    kinds = np.unique(motions.gas)
+    apart = np.concatenate([guesses[motions.gas == kind] - guesses[motions.gas == kind].mean(axis=0) for kind in kinds])
+    freedom = len(motions) - len(kinds)
+    spread = apart.T @ apart / freedom + motions.left.mean(axis=0)
+    reach = (n + 1) / n * 3 * freedom / (freedom - 2) * stats.f.ppf(0.95, 3, freedom - 2)
     variance, directions = np.linalg.eigh(spread * np.outer(mirror, mirror) * reach)
     return Forecast(point + mean * mirror, np.sqrt(variance[::-1]), directions.T[::-1], n)
 
@@ -83,16 +88,16 @@ def mirrored(side: Side) -> Array:
     return np.array([1.0 if side == "right" else -1.0, 1.0, 1.0])
 
 
-def calibrated_motions(state: State, gas: PleuralGas | None = None) -> Motions:
-    """Of the calibration's persons, those with this gas in the chest where it is given."""
-    return motions_of(calibration(), state, gas)
+def calibrated_motions(state: State) -> Motions:
+    """Of the persons of the calibration that comes with the program."""
+    return motions_of(calibration(), state)
 
 
-def motions_of(rows: list[dict[str, Any]], state: State, gas: PleuralGas | None = None) -> Motions:
+def motions_of(rows: list[dict[str, Any]], state: State) -> Motions:
     """Of the rows that a calibration writes."""
-    chosen = [row[state] for row in rows if gas in (None, row["gas"])]
-    shift, gradient, left = (np.array([row[key] for row in chosen]) for key in ("shift", "gradient", "left"))
-    return Motions(shift.reshape(-1, 3), gradient.reshape(-1, 3, 3), left.reshape(-1, 3, 3))
+    shift, gradient, left = (np.array([row[state][key] for row in rows]) for key in ("shift", "gradient", "left"))
+    gas = np.array([row["gas"] for row in rows])
+    return Motions(gas, shift.reshape(-1, 3), gradient.reshape(-1, 3, 3), left.reshape(-1, 3, 3))
 
 
 @cache

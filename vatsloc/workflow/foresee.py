@@ -41,8 +41,8 @@ def foresee_case(folder: Path, out: Path, say: Say = quiet) -> dict[str, Any]:
         lungs = prepare_lungs(case, stages)
         lung = lungs.of(case.side)
         middle = lung.grid.to_ras(np.argwhere(lung.inside).mean(axis=0))
-        motions = calibrated_motions("deflated", case.pleural_gas)
-        found = forecast(case.nodule.centre_ras, middle, case.side, motions)
+        motions = calibrated_motions("deflated")
+        found = forecast(case.nodule.centre_ras, middle, case.side, motions, case.pleural_gas)
         stages.warn(IS_FORECAST)
         told = _told(case, found, stages)
         with stages.stage("report"):

@@ -73,10 +73,9 @@ def locate_nodule(
     (lengths,), (axes,) = ellipsoid95(covariance(pose, collapse, nodule_inf[None], nodule_def[None]))
     gates = quality_gates(pose, collapse, settings.gates)
     gates["ellipsoid"] = ellipsoid_gate(lengths, settings.gates)
-    shown = {
-        "inflated": (prepared.inflated.field.usable, nodule_inf),
-        "deflated": (prepared.deflated.field.usable, nodule_def),
-    }
+    shown = {"deflated": (prepared.deflated.field.usable, nodule_def)}
+    if case.cbct_inflated is not None:
+        shown = {"inflated": (prepared.inflated.field.usable, nodule_inf), **shown}
     gates["nodule_in_view"] = in_view(shown, settings.gates.max_out_of_view_mm, stages)
     warn_of_doubts(pose, collapse, stages)
     return Localization(prepared, pose, collapse, nodule_inf, nodule_def, lengths, axes, gates)
@@ -90,8 +89,10 @@ def checked(
     """
     with stages.stage("check"):
         ct, prepared, pose, collapse = coarsen(case.ct, VOXEL_MM), found.prepared, found.pose, found.collapse
+        if phase1 is None and case.cbct_inflated is not None:
+            phase1 = compare(ct, prepared.inflated, pose.lung_inf, pose.inf_from_ct)
         checks = Checks(
-            phase1 or compare(ct, prepared.inflated, pose.lung_inf, pose.inf_from_ct),
+            phase1,
             compare(ct, prepared.deflated, collapse.observed.found.lung, found.def_from_ct),
         )
         here = found.nodule_inf[None], found.nodule_def[None]

@@ -57,15 +57,16 @@ def observe(
     rigid: RigidFit | None = None,
 ) -> Observed:
     """Register the spines (unless `rigid` is given), find the collapsed lung's surface and how its hilum moved."""
-    with stages.stage("spine inflated to deflated"):
-        rigid = rigid or register_spine(
-            prepared.deflated.volume,
-            prepared.inflated.volume,
-            prepared.spine_deflated.mask,
-            prepared.spine_inflated.mask,
-            fixed_seen=prepared.deflated.field.usable,
-            moving_seen=prepared.inflated.field.usable,
-        )
+    if rigid is None:
+        with stages.stage("spine inflated to deflated"):
+            rigid = register_spine(
+                prepared.deflated.volume,
+                prepared.inflated.volume,
+                prepared.spine_deflated.mask,
+                prepared.spine_inflated.mask,
+                fixed_seen=prepared.deflated.field.usable,
+                moving_seen=prepared.inflated.field.usable,
+            )
     def_from_inf = rigid.moving_from_fixed.inverse()
     before = TetMesh(def_from_inf(pose.points_inf), pose.mesh_ct.tets)
     with stages.stage("deflated surface", DEFLATED):
@@ -81,6 +82,18 @@ def observe(
         nodes = held_nodes(model_mesh, hilum.point_ras, settings.model.hilum_radius_mm)
         motion = _motion(prepared, prior, hilum, def_from_inf, model_mesh.points[nodes], settings)
     return Observed(rigid, found, surface, before, model_mesh, hilum, nodes, motion)
+
+
+def spine_from_ct(case: Case, prepared: Prepared, stages: Stages) -> RigidFit:
+    """The spine of the CT itself registered to the deflated CBCT, where no inflated one was taken."""
+    with stages.stage("spine CT to deflated"):
+        return register_spine(
+            prepared.deflated.volume,
+            case.ct,
+            prepared.spine_deflated.mask,
+            prepared.spine_ct.mask,
+            fixed_seen=prepared.deflated.field.usable,
+        )
 
 
 def held_nodes(mesh: TetMesh, hilum: Array, radius_mm: float) -> Array:

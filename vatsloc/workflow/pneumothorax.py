@@ -10,6 +10,7 @@ from poro.collapse import PoroSystem
 from poro.fit import Fit, Identifiability, identifiability
 from poro.mesh import TetMesh, TriSurface, interpolate, locate
 from registration.maps.rigid import RigidTransform
+from registration.spine import RigidFit
 from registration.volume import Array
 from vatsloc.case import Case
 from vatsloc.maps import MeshMap
@@ -73,9 +74,19 @@ class Collapse:
         return interpolate(locate(self.system.mesh, self.mesh_before.points), nodal)
 
 
-def pneumothorax(case: Case, prepared: Prepared, pose: ChangeOfPose, settings: Settings, stages: Stages) -> Collapse:
-    """See what there is of the collapsed lung, fit the poroelastic model to it, correct that by the images inside."""
-    observed = observe(case, prepared, pose, settings, stages)
+def pneumothorax(
+    case: Case,
+    prepared: Prepared,
+    pose: ChangeOfPose,
+    settings: Settings,
+    stages: Stages,
+    spine: RigidFit | None = None,
+) -> Collapse:
+    """See what there is of the collapsed lung, fit the poroelastic model to it, correct that by the images inside.
+
+    spine: its pose, where it is known.
+    """
+    observed = observe(case, prepared, pose, settings, stages, spine)
     return collapse(case, prepared, pose, observed, settings, stages)
 
 

@@ -50,12 +50,14 @@ Register = Callable[..., FfdFit]
 class ChangeOfPose:
     """The lung before its collapse. mesh_ct, points_inf: the same nodes in the CT and in the inflated CBCT, mm.
 
+    rigid: None without an inflated CBCT; what stands in for it (vatsloc/workflow/stand_in.py) lies in the CT's frame.
+
     ffd, its inversion at the nodes: None where the lung was left to the spine alone; extrapolation: None there too;
     seen: (n,) nodes that the scanner saw; lung_inf: lung mask in the CBCT; overlap: share of the
     lung in its field of view.
     """
 
-    rigid: RigidFit
+    rigid: RigidFit | None
     ffd: FfdFit | None
     lung_inf: Mask
     mesh_ct: TetMesh
@@ -68,7 +70,7 @@ class ChangeOfPose:
     @property
     def inf_from_ct_rigid(self) -> RigidTransform:
         """Rigid part, CT to inflated CBCT."""
-        return self.rigid.moving_from_fixed.inverse()
+        return RigidTransform.identity() if self.rigid is None else self.rigid.moving_from_fixed.inverse()
 
     @property
     def inf_from_ct(self) -> MeshMap:

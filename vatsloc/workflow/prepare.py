@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 from registration.volume import Mask, Volume
 from vatsloc.case import Case, CaseBefore
@@ -40,17 +40,23 @@ class Prepared(PreparedBefore):
     gas: PleuralGas
 
 
-def prepare(case: Case, stages: Stages, known: PreparedCt | None = None) -> Prepared:
+def prepare(case: Case, stages: Stages, known: PreparedBefore | None = None) -> Prepared:
     """Segment the CT and clean the cone-beam images, but for what is known.
 
-    Raises InputRefused when one does not show what it should.
+    Raises InputRefused when one does not show what it should, ValueError for a case without an inflated scan, or what
+    stands in for it.
     """
-    before = known if isinstance(known, PreparedBefore) else prepare_before(case, case.cbct_inflated, stages, known)
+    if known is None:
+        if case.cbct_inflated is None:
+            raise ValueError("the case has no inflated scan; give what stands in for it")
+        known = prepare_before(case, case.cbct_inflated, stages)
     deflated, spine = _cbct(case.cbct_deflated, DEFLATED, stages)
     with stages.stage("spines", DEFLATED):
-        gas = pleural_gas(before.inflated, deflated, before.spine_inflated, spine)
+        scanned = None if case.cbct_inflated is None else (known.inflated, known.spine_inflated)
+        gas = pleural_gas(scanned, (deflated, spine))
         gas.require(case.side, case.side_told_by)
-    return Prepared(**vars(before), deflated=deflated, spine_deflated=spine, gas=gas)
+    own = {f.name: getattr(known, f.name) for f in fields(PreparedBefore)}
+    return Prepared(**own, deflated=deflated, spine_deflated=spine, gas=gas)
 
 
 def prepare_before(

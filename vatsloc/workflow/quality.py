@@ -23,13 +23,11 @@ from vatsloc.workflow.stages import Stages
 def quality_gates(pose: ChangeOfPose, collapse: Collapse, limits: GateSettings) -> dict[str, Gate]:
     """Every check of a run but the nodule's own, by name."""
     gates: dict[str, Gate] = {}
-    for name, rigid in (("ct_inflated", pose.rigid), ("inflated_deflated", collapse.observed.rigid)):
-        gates |= _spine_gates(name, rigid, limits)
+    gates |= spine_gates(pose.rigid, collapse.observed.rigid, limits)
     after = collapse.mesh_after
     inverted = float((signed_volumes(after.points, after.tets) <= 0).mean())
     air, fissure = (len(collapse.observed.surface.only(border)) for border in (Border.AIR, Border.FISSURE))
     gates |= {
-        "overlap": at_least(pose.overlap, limits.min_overlap, "The inflated CBCT shows too little of the lung."),
         "inverted_elements": at_most(inverted, limits.max_inverted_elements, "The collapse turns elements inside out."),
         "deflated_surface": at_least(air, limits.min_surface_points, "Too little of the collapsed lung is seen."),
         "fissures": at_most(
@@ -43,6 +41,9 @@ def quality_gates(pose: ChangeOfPose, collapse: Collapse, limits: GateSettings) 
             "The lung's surface stays off the observed one.",
         ),
     }
+    if pose.rigid is not None:
+        too_little = "The inflated CBCT shows too little of the lung."
+        gates["overlap"] = at_least(pose.overlap, limits.min_overlap, too_little)
     if pose.ffd is not None:
         folded = pose.ffd.folded_share
         gates["registration_folds"] = at_most(
@@ -104,6 +105,13 @@ def warn_of_doubts(pose: ChangeOfPose, collapse: Collapse, stages: Stages) -> No
         stages.warn(f"The fit ended at a bound of {' and '.join(held)}: the model makes up there for what it lacks.")
     if np.any(collapse.fit.state.conflicts):
         stages.warn(f"{collapse.fit.state.conflicts} nodes were pushed behind the cage by the diaphragm.")
+
+
+def spine_gates(inflated: RigidFit | None, deflated: RigidFit, limits: GateSettings) -> dict[str, Gate]:
+    """Of the CT's spine in the inflated CBCT, if there is one, and of that one's, or the CT's, in the deflated one."""
+    if inflated is None:
+        return _spine_gates("ct_deflated", deflated, limits)
+    return _spine_gates("ct_inflated", inflated, limits) | _spine_gates("inflated_deflated", deflated, limits)
 
 
 def _spine_gates(name: str, rigid: RigidFit, limits: GateSettings) -> dict[str, Gate]:

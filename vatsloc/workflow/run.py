@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +11,11 @@ import numpy as np
 
 from poro.mesh import TetMesh
 from poro.mesh.tetmesh import signed_volumes
-from registration.images.resample import resample, resample_mask
-from registration.maps.field import DisplacementField
+from registration.images.resample import resample_mask
 from registration.spine import RigidFit
-from registration.volume import Array, Grid, Mask, Volume
+from registration.volume import Array, Mask, Volume
 from vatsloc.case import Case, read_case
+from vatsloc.formats.casefile import read_case_file
 from vatsloc.formats.folder import whole_folder
 from vatsloc.formats.meshes import Surface, TetraMesh
 from vatsloc.frames import flip_points
@@ -22,8 +23,9 @@ from vatsloc.maps import covered, sampled
 from vatsloc.report.collect import report_data
 from vatsloc.report.data import LUNG, SURFACE, Outline, Picture
 from vatsloc.report.render import write_report
-from vatsloc.results import OUTPUT_FILES, RADIUS95, REPORT, ResultData, RunRecord, write_results
+from vatsloc.results import RADIUS95, REPORT, ResultData, RunRecord, output_files, write_answer, write_results
 from vatsloc.slicer_scene import write_result_scenes
+from vatsloc.workflow.fields import Fields, fields_entry, fields_of, warped_ct
 from vatsloc.workflow.localization import Localization
 from vatsloc.workflow.localize import localize
 from vatsloc.workflow.pneumothorax import contact_surface
@@ -43,25 +45,37 @@ SEED = 0
 
 
 def run_case(
-    folder: Path, out: Path, settings: Settings, say: Say = quiet, state: Path | None = None
+    folder: Path,
+    out: Path,
+    settings: Settings,
+    say: Say = quiet,
+    state: Path | None = None,
+    answered: Callable[[dict[str, Any]], None] | None = None,
 ) -> dict[str, Any]:
     """Localize the nodule of the case in `folder`, write everything to `out`, return what run.json holds.
 
-    state: folder that `prepare_case` made, to go on from. Raises the errors of reading and of `localize`, CaseError for
+    state: folder that `prepare_case` made, to go on from; answered: is told what answer.json holds as soon as that is
+    known, before images, fields and report are made. Raises the errors of reading and of `localize`, CaseError for
     a state of another case; `out` is then untouched.
     """
     stages = Stages(say)
-    with whole_folder(out, OUTPUT_FILES) as partial, stages.named():
+    expected = output_files(read_case_file(folder).images.cbct_inflated is not None)
+    with whole_folder(out, expected) as partial, stages.named():
         with stages.stage("read"):
             case = read_case(folder)
         for sentence in case.warnings:
             stages.warn(sentence)
         known = None if state is None else _taken_up(state, case, settings, stages)
         found = localize(case, settings, stages, known)
+        record = _record(case, found, settings, stages)
+        answer = write_answer(partial, record, found.nodule_def)
+        if answered is not None:
+            answered(answer)
         with stages.stage("warp"):
-            fields = _fields(case, found)
+            fields = fields_of(case, found, settings.output.field_mm)
+            result = _result(case, found, fields, record)
         with stages.stage("write"):
-            result = _result(case, found, fields, _record(case, found, settings, stages))
+            result = replace(result, run=_with_fields(record, fields, found, stages))
             write_results(partial, result)
             write_result_scenes(partial, folder, out, result)
         with stages.stage("report"):
@@ -77,29 +91,7 @@ def _taken_up(folder: Path, case: Case, settings: Settings, stages: Stages) -> S
     return known
 
 
-@dataclass(frozen=True)
-class _Fields:
-    """The run's maps on voxels: from the CT on the lung's box, to the CT on the grids of the cone-beam CTs."""
-
-    inflated_from_ct: DisplacementField
-    deflated_from_ct: DisplacementField
-    ct_from_inflated: DisplacementField
-    ct_from_deflated: DisplacementField
-
-
-def _fields(case: Case, found: Localization) -> _Fields:
-    """Inside the lung by the mesh; images outside it follow the spine."""
-    box = _lung_box(found.prepared.lung_ct)
-    inflated, deflated = found.pose.inf_from_ct, found.def_from_ct
-    return _Fields(
-        sampled(inflated, box),
-        sampled(deflated, box),
-        sampled(inflated.inverse(), case.cbct_inflated.grid, beyond=False),
-        sampled(deflated.inverse(), case.cbct_deflated.grid, beyond=False),
-    )
-
-
-def _result(case: Case, found: Localization, fields: _Fields, run: RunRecord) -> ResultData:
+def _result(case: Case, found: Localization, fields: Fields, run: RunRecord) -> ResultData:
     pose, collapse = found.pose, found.collapse
     state, after = collapse.fit.state, collapse.mesh_after
     before = collapse.mesh_before
@@ -112,8 +104,10 @@ def _result(case: Case, found: Localization, fields: _Fields, run: RunRecord) ->
         nodule_inflated_ras=found.nodule_inf,
         nodule_deflated_ras=found.nodule_def,
         nodule_mask_deflated=_nodule_mask(case, found),
-        ct_in_inflated=resample(case.ct, case.cbct_inflated.grid, fields.ct_from_inflated),
-        ct_in_deflated=_ct_in_deflated(case, found, fields),
+        ct_in_inflated=None
+        if case.cbct_inflated is None
+        else warped_ct(case.ct, pose.inf_from_ct, case.cbct_inflated.grid),
+        ct_in_deflated=_ct_in_deflated(case, found),
         lung_ct=_tetra(pose.mesh_ct, np.zeros_like(pose.points_inf), none, np.ones(len(pose_det)), none),
         lung_inflated=_tetra(pose.mesh_inf, pose.points_inf - pose.mesh_ct.points, none, pose_det, none),
         lung_deflated=_with_radius95(found, _tetra(after, after.points - pose.points_inf, pressure, det_f, contact)),
@@ -142,13 +136,6 @@ def _with_radius95(found: Localization, lung: TetraMesh) -> TetraMesh:
     return replace(lung, point_data={**lung.point_data, RADIUS95: radius})
 
 
-def _lung_box(lung: Mask) -> Grid:
-    """The CT's grid about the lung."""
-    where = np.argwhere(lung.inside)
-    margin = np.ceil(FIELD_MARGIN_MM / lung.grid.spacing)
-    return lung.grid.box(where.min(axis=0) - margin, where.max(axis=0) + 1 + margin)
-
-
 def _nodule_mask(case: Case, found: Localization) -> Mask:
     """The nodule in the deflated CBCT; a nodule known by its centre alone is taken as a ball of 5 mm radius.
 
@@ -169,9 +156,9 @@ def _nodule_mask(case: Case, found: Localization) -> Mask:
     return Mask(inside, grid.ras_from_ijk)
 
 
-def _ct_in_deflated(case: Case, found: Localization, fields: _Fields) -> Volume:
+def _ct_in_deflated(case: Case, found: Localization) -> Volume:
     """The CT as the collapsed lung shows it: what was lung and is not any more has become pleural gas."""
-    warped = resample(case.ct, case.cbct_deflated.grid, fields.ct_from_deflated)
+    warped = warped_ct(case.ct, found.def_from_ct, case.cbct_deflated.grid)
     left = (
         covered(found.collapse.mesh_before, warped.grid).inside
         & ~covered(found.collapse.mesh_after, warped.grid).inside
@@ -203,8 +190,9 @@ def _record(case: Case, found: Localization, settings: Settings, stages: Stages)
             "gravity_ras": case.gravity_ras,
             "choices": [choice.entry() for choice in stages.choices],
             "solid": found.collapse.model.solid.entry(),
+            "scans": case.scans,
             "cbct_preparation": {
-                "inflated": found.prepared.inflated.removed.entry(),
+                "inflated": None if case.cbct_inflated is None else found.prepared.inflated.removed.entry(),
                 "deflated": found.prepared.deflated.removed.entry(),
             },
             "check": None if found.checks is None else found.checks.entry(found.nodule_inf, found.nodule_def),
@@ -213,13 +201,23 @@ def _record(case: Case, found: Localization, settings: Settings, stages: Stages)
     )
 
 
+def _with_fields(record: RunRecord, fields: Fields, found: Localization, stages: Stages) -> RunRecord:
+    """The record with what the fields leave out, and the seconds and memory of what followed the answer."""
+    details = {"peak_mb_by_stage": dict(stages.peak_mb), "fields": fields_entry(fields, found)}
+    return replace(
+        record,
+        seconds={**stages.seconds, "answer": record.seconds["total"], "total": stages.total_seconds},
+        peak_mb=max(stages.peak_mb.values()),
+        details={**record.details, **details},
+    )
+
+
 def _residuals(found: Localization) -> dict[str, Any]:
     """Residuals of each solver, with the status that it reports."""
     pose, collapse = found.pose, found.collapse
     state, motion = collapse.fit.state, collapse.observed.motion
     return {
-        "spine_ct_inflated": _spine(pose.rigid),
-        "spine_inflated_deflated": _spine(collapse.observed.rigid),
+        **_spines(pose.rigid, collapse.observed.rigid),
         **_change_of_pose(pose),
         "hilum": {"source": motion.source.value, "mean_mm": motion.displacement.mean(axis=0)},
         "fit": {
@@ -246,6 +244,12 @@ def _scatter_mm(found: Localization) -> float:
     """Root mean square distance in mm of the nodule in the ensemble from where the result puts it."""
     point = found.collapse.def_from_inf_rigid(found.nodule_inf[None])
     return float(np.sqrt(np.trace(scatter(found.collapse, point)[0])))
+
+
+def _spines(inflated: RigidFit | None, deflated: RigidFit) -> dict[str, Any]:
+    if inflated is None:
+        return {"spine_ct_deflated": _spine(deflated)}
+    return {"spine_ct_inflated": _spine(inflated), "spine_inflated_deflated": _spine(deflated)}
 
 
 def _spine(fit: RigidFit) -> dict[str, Any]:
@@ -289,10 +293,13 @@ def _corrected(residual: Residual | None) -> dict[str, Any] | None:
 def _pictures(case: Case, found: Localization) -> tuple[Picture, ...]:
     """Intermediate results that a reader should see before trusting the last one."""
     prepared, collapse = found.prepared, found.collapse
+    caption = "Lung in the inflated CBCT, after its cupping was taken away; planes through the nodule."
+    if case.cbct_inflated is None:
+        caption = "No inflated CBCT was taken: the CT stands in for it, as the change of pose is expected to leave it."
     return (
         Picture(
-            "Inflated lung as segmented",
-            "Lung in the inflated CBCT, after its cupping was taken away; planes through the nodule.",
+            "Inflated lung as segmented" if case.cbct_inflated is not None else "Inflated lung as expected",
+            caption,
             prepared.inflated.volume,
             found.nodule_inf,
             (Outline("inflated lung", LUNG, found.pose.lung_inf),),

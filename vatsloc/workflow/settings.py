@@ -92,6 +92,12 @@ class LeaveOutSettings(_Table):
     strained_share: float = Field(default=0.001, ge=-1)
 
 
+class OutputSettings(_Table):
+    """What is written. field_mm: how far apart, at most, the voxels of displacement fields lie; 0 for every voxel."""
+
+    field_mm: float = Field(default=3.0, ge=0)
+
+
 class GateSettings(_Table):
     """Limits beyond which a result is marked as not to be trusted."""
 
@@ -123,6 +129,7 @@ class Settings(_Table):
     residual: ResidualSettings = ResidualSettings()
     leave_out: LeaveOutSettings = LeaveOutSettings()
     gates: GateSettings = GateSettings()
+    output: OutputSettings = OutputSettings()
 
 
 PRESETS: dict[str, dict[str, Any]] = {

@@ -1,10 +1,10 @@
 """Two scans: where no inflated cone-beam CT was taken, the CT stands in for it, as the change of pose is expected to
 have left the lung.
 
-The change of pose is that of the calibration's phantoms (vatsloc/workflow/forecast.py): their mechanics turn the weight,
-let the diaphragm rise and the mediastinum fall, and let air out. What is special about this patient's is left to the
-second phase, whose model may strain and shift the lung as a whole, and whose keypoints are then matched between the CT
-and the collapsed lung.
+The change of pose is that of the calibration's phantoms (vatsloc/workflow/forecast.py): their mechanics turn the
+weight, let the diaphragm rise and the mediastinum fall, and let air out. What is special about this patient's is left
+to the second phase, whose model may strain and shift the lung as a whole, and whose keypoints are then matched between
+the CT and the collapsed lung.
 """
 
 from __future__ import annotations
@@ -69,5 +69,5 @@ def as_scan(image: Volume) -> PreparedCbct:
     everywhere = Mask(np.ones(image.hu.shape, dtype=bool), image.ras_from_ijk)
     axis = int(np.argmax(np.abs(image.grid.ras_from_ijk[2, :3])))
     field = FieldOfView(everywhere, everywhere, np.zeros(2), np.inf, axis)
-    seen = tissue_hu(image.hu)
+    seen = tissue_hu(image.hu.ravel())
     return PreparedCbct(image, field, Cupping(np.array([0.0, 1.0]), np.zeros(2), 1.0, seen, seen))

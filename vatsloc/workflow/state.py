@@ -52,6 +52,13 @@ class State:
     log: Log
 
     @property
+    def complete(self) -> tuple[PreparedBefore, ChangeOfPose] | None:
+        """What the second phase starts from; None where the inflated scan was not there."""
+        if isinstance(self.prepared, PreparedBefore) and self.pose is not None:
+            return self.prepared, self.pose
+        return None
+
+    @property
     def scans(self) -> tuple[str, ...]:
         """The scans that it was made of."""
         return (CT, INFLATED) if isinstance(self.prepared, PreparedBefore) else (CT,)
@@ -59,6 +66,8 @@ class State:
 
 def before_collapse(case: CaseBefore, settings: Settings, stages: Stages, known: State | None = None) -> State:
     """All stages that need no deflated scan, but for those whose outcome is known. Raises as `localize`."""
+    if known is not None and known.pose is not None:
+        return known
     ct = known.prepared if known is not None else prepare_ct(case, stages)
     if case.cbct_inflated is None:
         return State(ct, None, None, stages.log())
@@ -83,8 +92,7 @@ def prepare_case(folder: Path, out: Path, settings: Settings, say: Say = quiet) 
         known = _earlier(out, case, settings, say)
         if known is not None:
             stages.resume(known.log)
-        if known is None or case.cbct_inflated is not None:
-            known = before_collapse(case, settings, stages, known)
+        known = before_collapse(case, settings, stages, known)
         with stages.stage("write"):
             write_state(partial, known, key_of(case, settings, known.scans))
     return {"state": str(out), "scans": list(known.scans), "seconds": stages.total_seconds}
@@ -127,7 +135,7 @@ def read_state(folder: Path, case: CaseBefore, settings: Settings) -> State:
             f"{folder} was prepared with {' and '.join(other)} than this run has; run vatsloc prepare again."
         )
     try:
-        with np.load(folder / ARRAYS_FILE, allow_pickle=False) as file:
+        with (folder / ARRAYS_FILE).open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             arrays = [_laid_out(file[f"a{number}"], *layout) for number, layout in enumerate(told["layout"])]
         state = restored(told["state"], arrays)
         if not isinstance(state, State):

@@ -92,7 +92,7 @@ def run_ours(folder: Path, rounds: int = ROUNDS) -> Ours:
         pose.lung_inf,
         prepared.lung_ct,
         prepared.inflated.field.usable,
-        pose.rigid.moving_from_fixed,
+        pose.inf_from_ct_rigid.inverse(),
         inflated[known],
         ct[known],
     )

@@ -85,6 +85,8 @@ def beside_truth(found: Localization, dense: Array | None) -> list[Row]:
         ("phase 1", found.checks.phase1, found.pose.inf_from_ct, 1),
         ("chain", found.checks.chain, found.def_from_ct, 2),
     ):
+        if left is None:
+            continue
         error = carry(dense[:, 0]) - dense[:, image]
         distance, number = cKDTree(dense[:, image]).query(left.points, 4)
         weight = 1 / (distance + 1) ** 2
@@ -137,11 +139,10 @@ def _rows(scene: Scene, other: Case | None, found: Localization) -> list[tuple[s
 def _whole_runs(scene: Scene, other: Case | None) -> dict[str, Callable[[], Localization]]:
     """Faults that are in a run from the start, by name."""
     case, settings = scene.case, scene.settings
-    swapped = replace(case, cbct_inflated=case.cbct_deflated, cbct_deflated=case.cbct_inflated)
-    runs = {
-        "spine off one vertebra": lambda: _finished(slipped_spine(scene, np.random.default_rng(0))),
-        "scans swapped": lambda: localize(swapped, settings, Stages()),
-    }
+    runs = {"spine off one vertebra": lambda: _finished(slipped_spine(scene, np.random.default_rng(0)))}
+    if case.cbct_inflated is not None:
+        swapped = replace(case, cbct_inflated=case.cbct_deflated, cbct_deflated=case.cbct_inflated)
+        runs["scans swapped"] = lambda: localize(swapped, settings, Stages())
     if other is not None:
         strange = replace(case, cbct_deflated=other.cbct_deflated)
         runs["deflated scan of another patient"] = lambda: localize(strange, settings, Stages())

@@ -1,0 +1,100 @@
+"""A run's maps as displacement fields, on every n-th voxel of the images they belong to, and what that leaves out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from registration.images.resample import resample
+from registration.maps.field import DisplacementField
+from registration.volume import Array, Grid, Mask, Volume
+from vatsloc.case import Case
+from vatsloc.maps import MeshMap, sampled
+from vatsloc.workflow.localization import Localization
+
+MARGIN_MM = 10.0
+
+
+@dataclass(frozen=True)
+class Fields:
+    """The run's maps: from the CT on the lung's box, to the CT on the grids of the cone-beam CTs; None of a scan that
+    was not taken.
+    """
+
+    inflated_from_ct: DisplacementField | None
+    deflated_from_ct: DisplacementField
+    ct_from_inflated: DisplacementField | None
+    ct_from_deflated: DisplacementField
+
+
+def fields_of(case: Case, found: Localization, spacing_mm: float) -> Fields:
+    """Inside the lung by the mesh, outside it by the spine, on voxels at most `spacing_mm` apart, if there are such.
+
+    What leads to the CT goes on beyond the lung for one voxel's diagonal, so that values between voxels inside are not
+    blended with those outside.
+    """
+    box = thinned(lung_box(found.prepared.lung_ct), spacing_mm)
+    inflated, deflated, scan = found.pose.inf_from_ct, found.def_from_ct, case.cbct_inflated
+    return Fields(
+        None if scan is None else sampled(inflated, box),
+        sampled(deflated, box),
+        None if scan is None else _back(inflated, scan.grid, spacing_mm),
+        _back(deflated, case.cbct_deflated.grid, spacing_mm),
+    )
+
+
+def _back(scan_from_ct: MeshMap, grid: Grid, spacing_mm: float) -> DisplacementField:
+    """On a scan's grid, where in the CT to look."""
+    thin = thinned(grid, spacing_mm)
+    beyond = 0.0 if thin.shape == grid.shape else float(np.linalg.norm(thin.spacing))
+    return sampled(scan_from_ct.inverse(), thin, beyond)
+
+
+def warped_ct(ct: Volume, scan_from_ct: MeshMap, grid: Grid) -> Volume:
+    """The CT on every voxel of a scan's grid, as the scan should show it."""
+    return resample(ct, grid, sampled(scan_from_ct.inverse(), grid, 0.0))
+
+
+def thinned(grid: Grid, spacing_mm: float) -> Grid:
+    """Every n-th voxel of a grid from its first one on, n as large as leaves them no more than `spacing_mm` apart."""
+    n = np.maximum(np.floor(spacing_mm / grid.spacing + 1e-6), 1).astype(int)
+    affine = grid.ras_from_ijk.copy()
+    affine[:3, :3] = affine[:3, :3] * n
+    i, j, k = (int(-(-size // step)) for size, step in zip(grid.shape, n, strict=True))
+    return Grid((i, j, k), affine)
+
+
+def lung_box(lung: Mask) -> Grid:
+    """The CT's grid about the lung."""
+    where = np.argwhere(lung.inside)
+    margin = np.ceil(MARGIN_MM / lung.grid.spacing)
+    return lung.grid.box(where.min(axis=0) - margin, where.max(axis=0) + 1 + margin)
+
+
+def fields_entry(fields: Fields, found: Localization) -> dict[str, Any]:
+    """For run.json: how far apart each field's voxels lie, and how far off it is at the nodes of the lung's mesh, where
+    that is exact, mm.
+    """
+    ct, inflated, deflated = found.pose.mesh_ct.points, found.pose.points_inf, found.collapse.mesh_after.points
+    ends = {
+        "inflated_from_ct": (ct, inflated),
+        "deflated_from_ct": (ct, deflated),
+        "ct_from_inflated": (inflated, ct),
+        "ct_from_deflated": (deflated, ct),
+    }
+    told = {}
+    for name, (here, there) in ends.items():
+        field: DisplacementField | None = getattr(fields, name)
+        if field is not None:
+            told[name] = {"spacing_mm": field.grid.spacing, **_off(field, here, there)}
+    return told
+
+
+def _off(field: DisplacementField, here: Array, there: Array) -> dict[str, float]:
+    shown = np.all((field.grid.to_ijk(here) >= 0) & (field.grid.to_ijk(here) <= np.array(field.grid.shape) - 1), axis=1)
+    if not shown.any():
+        return {}
+    mm = np.linalg.norm(field(here[shown]) - there[shown], axis=1)
+    return {"off_mm_median": float(np.median(mm)), "off_mm_p95": float(np.percentile(mm, 95))}
