@@ -33,8 +33,7 @@ def constant(hu):
 def case():
     hints = Hints()
     known = Nodule(CT, None), np.array([-1.0, 0, 0]), "air", hints, {}, {}
-    scans = {"cbct_inflated": constant(-2), "cbct_deflated": constant(-3)}
-    return Case(Path("a-case"), "right", constant(-1), *known, **scans)
+    return Case(Path("a-case"), "right", constant(-1), constant(-2), *known, cbct_deflated=constant(-3))
 
 
 @pytest.fixture

@@ -81,6 +81,21 @@ def bench_fit_command(
         show(result)
 
 
+@bench.command("forecast")
+def bench_forecast_command(
+    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="JSON file of the rows; a rerun goes on.")],
+    names: Annotated[list[str] | None, typer.Argument(metavar="NAMES", help="Of the suite's phantoms; all.")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Forecasts from the CT alone beside where the suite's phantoms move their nodules; no image is made."""
+    from vatsloc.study.forecast import bench_forecast, table
+
+    result = bench_forecast(out, names or [], say)
+    say(table(result))
+    if as_json:
+        show(result)
+
+
 @bench.command("cbct")
 def bench_cbct_command(
     name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the phantom.")] = "demo",

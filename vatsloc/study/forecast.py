@@ -11,11 +11,15 @@ from typing import Any
 
 import numpy as np
 
-from phantoms.spec import Collapse, PhantomSpec
+from phantoms.spec import SPECS, SUITE, Collapse, PhantomSpec
 from phantoms.states import make_states
 from phantoms.thorax import draw_thorax
 from registration.volume import Array
+from vatsloc.evaluation.ellipsoid import in_ellipsoid
+from vatsloc.formats.casefile import PleuralGas
 from vatsloc.formats.folder import write_whole
+from vatsloc.workflow.forecast import calibrated_motions, forecast
+from vatsloc.workflow.pose import as_side
 from vatsloc.workflow.stages import Say, quiet
 
 FIRST_SEED = 3000
@@ -23,6 +27,8 @@ FIRST_SEED = 3000
 EVERY_CO2 = 3
 """One person in so many is insufflated with carbon dioxide."""
 ELEMENT_MM = 18.0
+TISSUE = 300
+"""About how many points of a lung are forecast besides the nodule."""
 
 
 def drawn_spec(seed: int) -> PhantomSpec:
@@ -83,3 +89,56 @@ def _rounded(value: Any) -> Any:
     if isinstance(value, list):
         return [_rounded(item) for item in value]
     return round(value, 5) if isinstance(value, float) else value
+
+
+def bench_forecast(out: Path, names: list[str], say: Say = quiet) -> dict[str, Any]:
+    """Forecasts of the suite's nodules beside where its phantoms' physics take them; rows that `out` holds are kept."""
+    rows = json.loads(out.read_text(encoding="utf-8")) if out.exists() else []
+    for name in names or [name for name in SUITE if not SPECS[name].refused]:
+        if all(row["name"] != name for row in rows):
+            say(f"phantom {name} ...")
+            rows.append(scored(SPECS[name], SUITE[name]))
+            write_whole(out, json.dumps(_rounded(rows), indent=1) + "\n")
+    errors = [row["nodule_mm"] for row in rows]
+    return {
+        "cases": rows,
+        "nodule_mean_mm": float(np.mean(errors)),
+        "nodule_max_mm": float(np.max(errors)),
+        "in_ellipsoid95": float(np.mean([row["in_ellipsoid95"] for row in rows])),
+        "tissue_in_ellipsoid95": float(np.mean([row["tissue_in_ellipsoid95"] for row in rows])),
+    }
+
+
+def scored(spec: PhantomSpec, seed: int) -> dict[str, Any]:
+    """One phantom's row: how far the nodule moves against the spine, how far off its forecast is, and whether the
+    ellipsoids hold it and how much of the tissue about the lung.
+    """
+    patient = draw_thorax(spec.side, spec.habitus, spec.lesion, seed, spec.fused).patient
+    states, _, _ = make_states(patient, spec, np.random.default_rng([seed, 11]))
+    lung = states[1].samples[patient.lung.sample(states[1].samples) < 0]
+    points = np.concatenate([patient.nodule.centre[None], lung[:: max(len(lung) // TISSUE, 1)]])
+    there, motions = states[1].lung_map(points), calibrated_motions("deflated")
+    side = as_side(spec.side)
+    gas: PleuralGas = "co2" if spec.collapse.gas == "co2" else "air"
+    found = [forecast(point, lung.mean(axis=0), side, motions, gas) for point in points]
+    held = [in_ellipsoid(t - f.centre, f.semi_axes_mm, f.axes) for t, f in zip(there, found, strict=True)]
+    return {
+        "name": spec.name,
+        "moves_mm": float(np.linalg.norm(there[0] - points[0])),
+        "nodule_mm": float(np.linalg.norm(there[0] - found[0].centre)),
+        "semi_axes_mm": found[0].semi_axes_mm.tolist(),
+        "in_ellipsoid95": bool(held[0]),
+        "tissue_in_ellipsoid95": float(np.mean(held[1:])),
+    }
+
+
+def table(result: dict[str, Any]) -> str:
+    """The rows as lines for people."""
+    lines = [f"{'phantom':<22}{'moves':>8}{'off, mm':>9}{'longest':>9}  held"]
+    for row in result["cases"]:
+        held = "yes" if row["in_ellipsoid95"] else "no"
+        lines.append(
+            f"{row['name']:<22}{row['moves_mm']:>8.1f}{row['nodule_mm']:>9.1f}{row['semi_axes_mm'][0]:>9.1f}  {held}"
+        )
+    lines.append(f"mean {result['nodule_mean_mm']:.1f} mm, held {100 * result['in_ellipsoid95']:.0f} %")
+    return "\n".join(lines)

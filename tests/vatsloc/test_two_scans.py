@@ -1,0 +1,114 @@
+"""Two scans: the CT stands in for an inflated scan that was not taken."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from registration.volume import Volume
+from tests.vatsloc import run_scene as known
+from vatsloc.case import read_case
+from vatsloc.evaluation import evaluate_case
+from vatsloc.results import output_files
+from vatsloc.synthetic.case import write_phantom
+from vatsloc.workflow.run import run_case
+from vatsloc.workflow.settings import Settings, load_settings
+from vatsloc.workflow.stages import Stages
+from vatsloc.workflow.stand_in import as_scan, expected_pose, moved_ct, stand_in
+from vatsloc.workflow.state import before_collapse
+
+
+@pytest.fixture(scope="module")
+def case(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The demo without its inflated scan and without the landmarks in it."""
+    folder = tmp_path_factory.mktemp("two") / "demo"
+    write_phantom("demo", folder)
+    for path in (*folder.glob("*inflated*"), *folder.glob("truth/*inflated*")):
+        path.unlink()
+    lines = (folder / "case.toml").read_text(encoding="utf-8").splitlines()
+    (folder / "case.toml").write_text("\n".join(line for line in lines if not line.startswith("cbct_inflated")))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def result(case: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("two-result") / "demo"
+    answers: list[dict[str, Any]] = []
+    run_case(case, out, load_settings("fast", None), answered=answers.append)
+    assert answers == [json.loads((out / "answer.json").read_text(encoding="utf-8"))]
+    return out
+
+
+def test_a_run_of_two_scans_says_so_and_writes_nothing_about_the_third(result: Path) -> None:
+    assert sorted(path.name for path in result.iterdir()) == sorted(output_files(inflated=False))
+    assert not [path.name for path in result.iterdir() if "inflated" in path.name]
+    run = json.loads((result / "run.json").read_text(encoding="utf-8"))
+    assert run["scans"] == ["ct", "cbct_deflated"]
+    assert any("No inflated CBCT was taken" in warning for warning in run["warnings"])
+    assert run["check"]["phase1"] is None
+    assert run["cbct_preparation"]["inflated"] is None
+    assert {"spine_ct_deflated", "check", "recognized"} <= set(run["gates"])
+    assert not {"overlap", "spine_ct_inflated", "check_phase1"} & set(run["gates"])
+    assert set(run["fields"]) == {"deflated_from_ct", "ct_from_deflated"}
+    assert "No inflated CBCT was taken" in (result / "report.html").read_text(encoding="utf-8")
+
+
+def test_it_finds_the_lung_s_tissue_by_keypoints_between_the_ct_and_the_collapsed_lung(
+    case: Path, result: Path, tmp_path: Path
+) -> None:
+    copy = tmp_path / "scored"
+    shutil.copytree(result, copy)
+    scores = evaluate_case(case, copy)
+    assert scores["rigid_ct_deflated"]["mean"] > 20
+    assert scores["chain"]["mean"] < 1.5
+    assert scores["nodule_deflated_mm"] < 3
+    assert scores["nodule_in_ellipsoid95"]
+    assert (scores["phase1"]["n"], scores["phase1"]["mean"], scores["nodule_inflated_mm"]) == (0, None, None)
+
+
+def test_the_ct_alone_is_prepared_once_and_the_inflated_lung_expected_from_it(case: Path) -> None:
+    here, fast, stages = read_case(case), load_settings("fast", None), Stages()
+    state = before_collapse(here, fast, stages)
+    assert state.complete is None
+    before, pose = stand_in(here, state.prepared, fast, stages)
+    assert pose.rigid is None
+    assert_allclose(pose.inf_from_ct_rigid.matrix, np.eye(4))
+    ratio = pose.mesh_inf.volumes.sum() / pose.mesh_ct.volumes.sum()
+    assert 0.8 < ratio < 0.95
+    lung = pose.lung_inf
+    deep = before.inflated.volume.hu[lung.inside]
+    ct = here.ct.hu[state.prepared.lung_ct.inside]
+    assert np.median(deep) + 1000 == pytest.approx((np.median(ct) + 1000) / ratio, rel=0.05)
+    assert before.inflated.field.usable.inside.all()
+
+
+def test_the_moved_ct_shows_tissue_where_it_went_and_denser_by_its_loss_of_volume() -> None:
+    scene = known.scene()
+    pose = expected_pose(
+        scene.pose.mesh_ct, known.CENTRE + 0.8 * (scene.pose.mesh_ct.points - known.CENTRE), known.CT_GRID
+    )
+    flat = Volume(np.full(known.CT_GRID.shape, -800.0, np.float32), known.CT_GRID.ras_from_ijk)
+    moved = moved_ct(flat, pose.inf_from_ct, pose.lung_inf.grid)
+    assert_allclose(moved.hu[pose.lung_inf.inside], 200 / 0.8**3 - 1000, rtol=1e-4)
+    far = np.linalg.norm(moved.grid.points() - known.CENTRE, axis=-1) < 0.7 * known.RADIUS_MM
+    shown = moved_ct(scene.case.ct, pose.inf_from_ct, pose.lung_inf.grid)
+    there = known.CENTRE + (shown.grid.points()[far] - known.CENTRE) / 0.8
+    assert_allclose(shown.hu[far], (known.ct_hu(there) + 1000) / 0.8**3 - 1000, atol=8)
+    assert as_scan(flat).field.radius_mm == np.inf
+
+
+def test_without_an_inflated_scan_the_ellipsoid_is_wider() -> None:
+    from vatsloc.workflow.uncertainty import WITHOUT_INFLATED, covariance
+
+    scene = known.scene()
+    points = known.NODULE_INF[None], known.NODULE_DEF[None]
+    three = covariance(scene.pose, scene.collapse, *points)
+    two = covariance(scene.with_pose(rigid=None).pose, scene.collapse, *points)
+    assert_allclose(two, WITHOUT_INFLATED**2 * three)
+    assert Settings().output.field_mm == 3.0
