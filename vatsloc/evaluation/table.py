@@ -43,7 +43,8 @@ def table(summary: Mapping[str, Any]) -> str:
 def _class_line(told: Mapping[str, Any]) -> str:
     """One class of depth below the pleura."""
     to = "deeper" if told["to_mm"] is None else f"{told['to_mm']:.0f} mm"
-    phase1, chain = (f"{_mm(told[m]['mean'])} / {_mm(told[m]['p95'])}" for m in ("phase1", "chain"))
+    scores = (told[measure] or {"mean": None, "p95": None} for measure in ("phase1", "chain"))
+    phase1, chain = (f"{_mm(score['mean'])} / {_mm(score['p95'])}" for score in scores)
     share = told["share_in_radius95"]
     held = "" if share is None else f", {share:.1%} within their 95 % radius"
     return f"tissue seen, {told['from_mm']:.0f} mm to {to}: mean / 95 % phase 1 {phase1}, chain {chain}{held}"
