@@ -29,6 +29,7 @@ from vatsloc.workflow.localize import localize
 from vatsloc.workflow.pneumothorax import contact_surface
 from vatsloc.workflow.pose import ChangeOfPose
 from vatsloc.workflow.quality import surface_distances
+from vatsloc.workflow.refinement import BlockRefinement
 from vatsloc.workflow.residual import Residual
 from vatsloc.workflow.settings import Settings
 from vatsloc.workflow.stages import Say, Stages, quiet
@@ -224,9 +225,14 @@ def _residuals(found: Localization) -> dict[str, Any]:
         "perturbation_ensemble": {"number": len(collapse.model.ensemble), "rms_mm_at_nodule": _scatter_mm(found)},
         "model_selection": [asdict(refinement) for refinement in collapse.model.refinements],
         "residual_registration": _corrected(collapse.residual),
+        "block_refinement": {"inflated": _passes(pose.refinement), "deflated": _passes(collapse.refinement)},
         "surface_mm": {f"p{share}": np.percentile(surface_distances(collapse), share) for share in (50, 75, 90, 95)},
         "mesh": {"tetrahedra": len(pose.mesh_ct.tets), "model_tetrahedra": len(collapse.system.mesh.tets)},
     }
+
+
+def _passes(refinement: BlockRefinement | None) -> list[dict[str, Any]] | None:
+    return None if refinement is None else [asdict(one) for one in refinement.passes]
 
 
 def _scatter_mm(found: Localization) -> float:

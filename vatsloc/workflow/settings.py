@@ -79,6 +79,15 @@ class ResidualSettings(_Table):
     max_disagreement_mm: float = Field(default=3.0, gt=0)
 
 
+class RefinementSettings(_Table):
+    """Small blocks of the CT found in both cone-beam CTs, once everything else has aligned them. cell_mm: at most one
+    block per cell.
+    """
+
+    on: bool = True
+    cell_mm: float = Field(default=5.0, ge=2, le=20)
+
+
 class LeaveOutSettings(_Table):
     """Up to which value, measured on the scene, a part is left out.
 
@@ -121,6 +130,7 @@ class Settings(_Table):
     model: ModelSettings = ModelSettings()
     keypoints: KeypointSettings = KeypointSettings()
     residual: ResidualSettings = ResidualSettings()
+    refinement: RefinementSettings = RefinementSettings()
     leave_out: LeaveOutSettings = LeaveOutSettings()
     gates: GateSettings = GateSettings()
 
