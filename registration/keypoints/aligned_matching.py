@@ -12,11 +12,16 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from scipy import ndimage
 
 from registration.correspondences import Correspondences
 from registration.keypoints.affine_matching import MaskedImage, match_affine_blocks
-from registration.keypoints.matching import moves_with_neighbours, smoothed
+from registration.keypoints.matching import moves_with_neighbours
 from registration.volume import Array, Mask, Volume
+
+BLUR_VOXELS = 0.5
+CONTINUED_VOXELS = 1.0
+"""Standard deviation of the means of what lies inside, which stand in for what lies just outside."""
 
 
 class Linearized(NamedTuple):
@@ -79,8 +84,8 @@ def match_aligned(
     )
     voxel = float(fixed.grid.spacing.mean())
     found = match_affine_blocks(
-        MaskedImage(smoothed(fixed).hu, regions.fixed.inside),
-        MaskedImage(smoothed(moving).hu, regions.moving.inside),
+        _within(fixed, regions.fixed),
+        _within(moving, regions.moving),
         starts,
         affines,
         settings.radius,
@@ -91,3 +96,17 @@ def match_aligned(
     matches = Correspondences.of(at[holds], moved[holds], found.ncc[holds])
     off = found.shift[holds] @ fixed.ras_from_ijk[:3, :3].T
     return matches.only(moves_with_neighbours(matches.fixed, off, settings.neighbours, settings.outlier_mm))
+
+
+def _within(image: Volume, region: Mask) -> MaskedImage:
+    """The image blurred as all blocks are, by what lies in the region alone, which a border of two voxels continues: no
+    grey value from beyond the region enters a block, whether by blurring or between voxels.
+    """
+    inside = region.inside.astype(np.float32)
+    known = image.hu * inside
+    fine, wide = (
+        ndimage.gaussian_filter(known, sigma, truncate=3.0)
+        / np.maximum(ndimage.gaussian_filter(inside, sigma, truncate=3.0), 1e-6)
+        for sigma in (BLUR_VOXELS, CONTINUED_VOXELS)
+    )
+    return MaskedImage(np.where(region.inside, fine, wide).astype(np.float32), region.inside)

@@ -28,13 +28,13 @@ from vatsloc.workflow.model_selection import (
     CollapseModel,
     Refinement,
     _regional,
-    _too_few,
     corrected,
     fit_settings,
     held_out,
     select_model,
     select_refinement,
     surface_target,
+    too_few,
 )
 from vatsloc.workflow.settings import settings_of
 from vatsloc.workflow.stages import Stages
@@ -183,14 +183,14 @@ def test_refinements_add_up_and_the_last_one_kept_says_what_remains() -> None:
 
 
 def test_too_few_or_too_crowded_keypoints_judge_nothing() -> None:
-    assert _too_few(pairs_of()) is None
-    assert _too_few(pairs_of(39)) == "only 39 keypoints were matched inside the lung"
+    assert too_few(pairs_of()) is None
+    assert too_few(pairs_of(39)) == "only 39 keypoints were matched inside the lung"
     many = pairs_of(2000)
     hidden, shown = np.flatnonzero(held_out(many.fixed)), np.flatnonzero(~held_out(many.fixed))
     for h, s in ((10, 30), (40, 10)):
-        assert _too_few(many.only(np.concatenate([hidden[:h], shown[:s]]))) is None
+        assert too_few(many.only(np.concatenate([hidden[:h], shown[:s]]))) is None
     for h, s in ((9, 31), (41, 9)):
-        assert "too close together" in str(_too_few(many.only(np.concatenate([hidden[:h], shown[:s]]))))
+        assert "too close together" in str(too_few(many.only(np.concatenate([hidden[:h], shown[:s]]))))
 
 
 def test_every_border_but_a_fissure_is_a_target_with_its_own_confidence_and_normal() -> None:

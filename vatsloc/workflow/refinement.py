@@ -16,7 +16,7 @@ from poro.fit import PointConstraints, elastic_correction
 from poro.mesh import TetMesh, closest_points
 from poro.mesh.tetmesh import signed_volumes
 from registration.correspondences import Correspondences
-from registration.images.morphology import bounding_box
+from registration.images.morphology import bounding_box, erode
 from registration.images.resample import coarsen, resample_mask
 from registration.keypoints.aligned_matching import AlignedSettings, Regions, match_aligned
 from registration.keypoints.matching import MatchSettings, detect_inside
@@ -30,6 +30,8 @@ PASSES = ((1.5, 6.0), (1.0, 3.0))
 """Voxels of the blocks and how far they are looked for, mm, pass by pass."""
 MARGIN_MM = 16.0
 """What is kept of a scan about the lung: more than a block and its search reach."""
+RIM_MM = 2.5
+"""What is cut off the lung in both images: nearer than this to its border, voxels also show what lies beyond."""
 SIGMA_MM, STRAIN = 1.0, 0.007
 """Standard deviation of a block's position, and how far tissue gives way to it (`elastic_correction`)."""
 ANCHOR_SIGMA_MM = 0.2
@@ -68,10 +70,11 @@ class Shape:
 
 @dataclass(frozen=True)
 class Pass:
-    """One pass. blocks: how many were found; before_mm, after_mm: median misfit at held-out ones, without and with
-    following the others; kept: whether the lung followed.
+    """One pass. voxel_mm: of the blocks; blocks: how many were found; before_mm, after_mm: median misfit at held-out
+    ones, without and with following the others; kept: whether the lung followed.
     """
 
+    voxel_mm: float
     blocks: int
     before_mm: float
     after_mm: float
@@ -97,17 +100,16 @@ def refine_by_blocks(compared: Compared, shape: Shape, settings: RefinementSetti
         if too_few(matches):
             break
         hidden = held_out(matches.fixed, APART_MM)
-        trial = _followed(shape, shape.anchors, matches.only(~hidden))
-        before, after = (_misfit(lung, matches.only(hidden)) for lung in (shape, trial))
-        followed = _followed(shape, shape.anchors, matches) if after < before else shape
-        kept = followed is not shape
-        passes.append(Pass(len(matches), before, after, kept))
-        shape = followed
+        tested = matches.only(hidden)
+        before, after = _misfit(shape, tested), _misfit(_followed(shape, matches.only(~hidden)), tested)
+        passes.append(Pass(voxel_mm, len(matches), before, after, after < before))
+        if after < before:
+            shape = _followed(shape, matches)
     return BlockRefinement(shape.map.moved, tuple(passes))
 
 
 def _around(compared: Compared) -> Compared:
-    """The scan cut to its lung, the CT to the lung there."""
+    """The scan cut to its lung, the CT to the lung there, and of the lungs what lies deeper than RIM_MM."""
     scan, ct = compared.scan, compared.ct
     lung = resample_mask(compared.lung, scan.volume.grid)
     lung = Mask(lung.inside & scan.field.usable.inside, lung.ras_from_ijk)
@@ -117,7 +119,11 @@ def _around(compared: Compared) -> Compared:
     cut = bounding_box(lung.inside, margin)
     lung_ct = resample_mask(compared.lung_ct, ct.grid)
     cut_ct = bounding_box(lung_ct.inside, np.ceil(MARGIN_MM / ct.grid.spacing).astype(int))
-    return Compared(ct.part(cut_ct), lung_ct.part(cut_ct), replace(scan, volume=scan.volume.part(cut)), lung.part(cut))
+    inner, inner_ct = (
+        Mask(erode(mask.inside, RIM_MM, mask.grid.spacing), mask.ras_from_ijk)
+        for mask in (lung.part(cut), lung_ct.part(cut_ct))
+    )
+    return Compared(ct.part(cut_ct), inner_ct, replace(scan, volume=scan.volume.part(cut)), inner)
 
 
 def _starts(compared: Compared, cell_mm: float) -> Array:
@@ -145,11 +151,11 @@ def _depth(mesh: TetMesh, points: Array) -> Array:
     return -closest_points(mesh.boundary, points).distance
 
 
-def _followed(shape: Shape, anchors: Array, matches: Correspondences) -> Shape:
-    """The lung after it followed matches, nodes `anchors` (k,) held. Nodes of elements that would turn over are held
-    too; as it was where that does not help.
+def _followed(shape: Shape, matches: Correspondences) -> Shape:
+    """The lung after it followed matches. Nodes of elements that would turn over are held too; as it was where that
+    does not help.
     """
-    rest, now = shape.rest, shape.map.moved
+    anchors, rest, now = shape.anchors, shape.rest, shape.map.moved
     at = MeshMap(shape.map.mesh, rest.points, shape.map.around)(matches.moving)
     offset = matches.fixed - shape.map(matches.moving)
     turned = signed_volumes(now, rest.tets) <= 0
