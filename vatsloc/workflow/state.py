@@ -127,7 +127,7 @@ def read_state(folder: Path, case: CaseBefore, settings: Settings) -> State:
             f"{folder} was prepared with {' and '.join(other)} than this run has; run vatsloc prepare again."
         )
     try:
-        with np.load(folder / ARRAYS_FILE, allow_pickle=False) as file:
+        with (folder / ARRAYS_FILE).open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             arrays = [_laid_out(file[f"a{number}"], *layout) for number, layout in enumerate(told["layout"])]
         state = restored(told["state"], arrays)
         if not isinstance(state, State):
