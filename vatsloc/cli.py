@@ -46,13 +46,14 @@ def localize(
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Results folder, written whole or not at all.")],
     preset: Annotated[str, typer.Option(metavar="NAME", help="fast, balanced, accurate or auto.")] = "balanced",
     settings: Annotated[Path | None, typer.Option(metavar="FILE", help="TOML file that overrides the preset.")] = None,
+    state: Annotated[Path | None, typer.Option(metavar="STATE", help="What `vatsloc prepare` made of CASE.")] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Find the nodule of CASE in the deflated cone-beam CT."""
     from vatsloc.workflow.run import run_case
     from vatsloc.workflow.settings import load_settings
 
-    run = run_case(case, out, load_settings(preset, settings), say)
+    run = run_case(case, out, load_settings(preset, settings), say, state)
     if as_json:
         show(run)
     else:
@@ -61,6 +62,25 @@ def localize(
     failed = [gate["says"] for gate in run["gates"].values() if not gate["ok"]]
     if failed:
         raise GateFailed(f"The result is written to {out}, but do not trust it: {' '.join(failed)}")
+
+
+@app.command()
+def prepare(
+    case: CaseArgument,
+    out: Annotated[Path, typer.Option("--out", metavar="STATE", help="Folder for `localize --state` to go on from.")],
+    preset: Annotated[str, typer.Option(metavar="NAME", help="fast, balanced, accurate or auto.")] = "balanced",
+    settings: Annotated[Path | None, typer.Option(metavar="FILE", help="TOML file that overrides the preset.")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Do all that needs no deflated scan: after the CT alone, and again once the inflated scan is there."""
+    from vatsloc.workflow.settings import load_settings
+    from vatsloc.workflow.state import prepare_case
+
+    told = prepare_case(case, out, load_settings(preset, settings), say)
+    if as_json:
+        show(told)
+    else:
+        print(f"{out} holds what {' and '.join(told['scans'])} tell; go on by vatsloc localize CASE --state {out}")
 
 
 @app.command()

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import platform
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -156,6 +158,17 @@ def versions() -> dict[str, str]:
     """Versions of the program, of Python and of the packages that shape the numbers."""
     packages = (PROGRAM, "numpy", "scipy", "numba", "scikit-fem", "pyamg", "scikit-image")
     return {"python": platform.python_version(), **{name: metadata.version(name) for name in packages}}
+
+
+@cache
+def source_digest() -> str:
+    """Digest of the program's own source files: any change of it is another program."""
+    told = hashlib.blake2b(digest_size=16)
+    root = Path(__file__).parents[1]
+    for package in ("registration", "poro", "vatsloc"):
+        for file in sorted((root / package).rglob("*.py")):
+            told.update(file.relative_to(root).as_posix().encode() + file.read_bytes())
+    return told.hexdigest()
 
 
 def _write_small_files(folder: Path, data: ResultData) -> None:

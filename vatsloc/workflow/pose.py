@@ -18,12 +18,12 @@ from registration.maps.rigid import RigidTransform
 from registration.sliding import SlidingFit, register_sliding
 from registration.spine import RigidFit, SpineSearch, register_spine
 from registration.volume import Array, Mask
-from vatsloc.case import Case
+from vatsloc.case import CaseBefore
 from vatsloc.imaging.lungs import Side
 from vatsloc.imaging.thorax import carry_prior, inflated_lung, require_share, visible_share
 from vatsloc.maps import MeshMap
 from vatsloc.workflow.choices import Choice, weigh
-from vatsloc.workflow.prepare import Prepared
+from vatsloc.workflow.prepare import PreparedBefore
 from vatsloc.workflow.refinement import BlockRefinement, Compared, Shape, refine_by_blocks
 from vatsloc.workflow.settings import RegistrationSettings, Settings
 from vatsloc.workflow.stages import CT, INFLATED, Stages
@@ -84,7 +84,11 @@ class ChangeOfPose:
 
 
 def change_of_pose(
-    case: Case, prepared: Prepared, settings: Settings, stages: Stages, register: Register = register_sliding
+    case: CaseBefore,
+    prepared: PreparedBefore,
+    settings: Settings,
+    stages: Stages,
+    register: Register = register_sliding,
 ) -> ChangeOfPose:
     """Register the CT to the inflated CBCT and continue the motion to the whole lung."""
     hinted = _hinted(case)
@@ -226,7 +230,7 @@ def as_side(side: str) -> Side:
     return "left" if side == "left" else "right"
 
 
-def _hinted(case: Case) -> RigidTransform | None:
+def _hinted(case: CaseBefore) -> RigidTransform | None:
     """Start of the spine search from the same vertebra marked in both images; None without hints."""
     ct, inflated = case.hints.spine_ct_ras, case.hints.spine_cbct_inflated_ras
     if ct is None or inflated is None:

@@ -33,6 +33,7 @@ from vatsloc.workflow.refinement import BlockRefinement
 from vatsloc.workflow.residual import Residual
 from vatsloc.workflow.settings import Settings
 from vatsloc.workflow.stages import Say, Stages, quiet
+from vatsloc.workflow.state import State, read_state
 from vatsloc.workflow.uncertainty import radius95, scatter
 
 FIELD_MARGIN_MM = 10.0
@@ -42,10 +43,13 @@ SEED = 0
 """Of the spine's samples, the only thing drawn at random; fixed, so that a run can be repeated."""
 
 
-def run_case(folder: Path, out: Path, settings: Settings, say: Say = quiet) -> dict[str, Any]:
+def run_case(
+    folder: Path, out: Path, settings: Settings, say: Say = quiet, state: Path | None = None
+) -> dict[str, Any]:
     """Localize the nodule of the case in `folder`, write everything to `out`, return what run.json holds.
 
-    Raises the errors of reading and of `localize`; `out` is then untouched.
+    state: folder that `prepare_case` made, to go on from. Raises the errors of reading and of `localize`, CaseError for
+    a state of another case; `out` is then untouched.
     """
     stages = Stages(say)
     with whole_folder(out, OUTPUT_FILES) as partial, stages.named():
@@ -53,7 +57,8 @@ def run_case(folder: Path, out: Path, settings: Settings, say: Say = quiet) -> d
             case = read_case(folder)
         for sentence in case.warnings:
             stages.warn(sentence)
-        found = localize(case, settings, stages)
+        known = None if state is None else _taken_up(state, case, settings, stages)
+        found = localize(case, settings, stages, known)
         with stages.stage("warp"):
             fields = _fields(case, found)
         with stages.stage("write"):
@@ -63,6 +68,14 @@ def run_case(folder: Path, out: Path, settings: Settings, say: Say = quiet) -> d
         with stages.stage("report"):
             write_report(partial / REPORT, report_data(case, result, _pictures(case, found)))
     return result.run.as_json()
+
+
+def _taken_up(folder: Path, case: Case, settings: Settings, stages: Stages) -> State:
+    """The state in a folder, and what its stages had to say."""
+    with stages.stage("read"):
+        known = read_state(folder, case, settings)
+    stages.resume(known.log)
+    return known
 
 
 @dataclass(frozen=True)
