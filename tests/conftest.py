@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command line does, before numpy is imported
+for threads in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
+    os.environ.setdefault(threads, "1")  # before numpy is imported; two workers share two cores
 
 SHARED = Path(os.environ.get("VATSLOC_SHARED", Path(__file__).resolve().parents[2] / "shared"))
 

@@ -31,18 +31,38 @@ from tests.faults.mutants import Mutant, mutants, sibling_fields
 from tests.faults.table import Name, Record, name_of, table
 
 ROOT = Path(__file__).resolve().parents[1]
+
+
+def named(folder: str, words: str) -> tuple[str, ...]:
+    """Test files of a folder by the rest of their names."""
+    return tuple(f"tests/{folder}/test_{word}.py" for word in words.split())
+
+
 # Modules that decide correctness: the test files that judge them, () for those that import them, None for none.
 Scope = Mapping[str, tuple[str, ...] | None]
+# Rooms whose own tests are slower than others that import them too, or reach them over a front door, name theirs.
 SCOPE: Scope = {
     "registration/**/*.py": (),
     "poro/**/*.py": (),
-    "vatsloc/case.py": (),
+    "poro/contact/*.py": named("poro", "contact hertz"),
+    "poro/mesh/*.py": (*named("poro", "mesh mesh_masks contact fit"), *named("vatsloc", "shuffled_nodes breathing")),
+    "vatsloc/case.py": named("vatsloc", "case marks new_case greyvalues dicom_regions"),
     "vatsloc/frames.py": (),
     "vatsloc/maps.py": (),
     "vatsloc/results.py": (),
     "vatsloc/evaluation/**/*.py": (),
-    "vatsloc/formats/**/*.py": (),
-    "vatsloc/imaging/**/*.py": (),
+    "vatsloc/formats/**/*.py": named(
+        "vatsloc",
+        "formats_images formats_fields formats_folder formats_markups formats_meshes formats_transforms "
+        "malformed_images malformed_marks case marks results_roundtrip slicer_scene",
+    ),
+    "vatsloc/formats/dicom/*.py": named(
+        "vatsloc", "formats_dicom dicom_series dicom_pixels dicom_regions dicom_malformed marks"
+    ),
+    "vatsloc/imaging/**/*.py": named(
+        "vatsloc",
+        "imaging_cbct imaging_lung_hint imaging_lungs imaging_pleura greyvalues surface_points hilum_motion new_case",
+    ),
     "vatsloc/workflow/**/*.py": (),
     "vatsloc/workflow/stages.py": None,  # seconds, memory and messages
 }

@@ -68,6 +68,32 @@ def test_one_slice_has_a_thickness(tmp_path):
     assert mask.inside.sum() == 9
 
 
+@pytest.mark.parametrize(
+    ("stated", "thick"),
+    [
+        ({"SpacingBetweenSlices": 3, "SliceThickness": 5}, 3.0),
+        ({"SliceThickness": 5}, 5.0),
+        ({"SpacingBetweenSlices": 0, "SliceThickness": 5}, 5.0),
+    ],
+)
+def test_one_slice_is_as_thick_as_slices_are_apart_or_else_as_stated(tmp_path, stated, thick):
+    on = grid()
+    ds = segmentation(on, {"nodule": blob(on, (2, 5), (3, 6), (4, 5))})
+    measures = ds.SharedFunctionalGroupsSequence[0].PixelMeasuresSequence[0]
+    del measures.SpacingBetweenSlices
+    for name, value in stated.items():
+        setattr(measures, name, value)
+    assert read_mask(written(ds, tmp_path / "seg.dcm")).grid.spacing[2] == pytest.approx(thick)
+
+
+def test_one_slice_without_a_thickness_is_refused(tmp_path):
+    on = grid()
+    ds = segmentation(on, {"nodule": blob(on, (2, 5), (3, 6), (4, 5))})
+    del ds.SharedFunctionalGroupsSequence[0].PixelMeasuresSequence[0].SpacingBetweenSlices
+    with pytest.raises(InputRefused, match="states no SpacingBetweenSlices"):
+        read_mask(written(ds, tmp_path / "seg.dcm"))
+
+
 def test_contours_are_filled_by_even_odd(tmp_path):
     on = grid()
     loops = [rectangle(on, (2, 9), (1, 8), k) for k in (2, 3, 4)] + [rectangle(on, (4, 6), (3, 5), 3)]
