@@ -53,8 +53,8 @@ class Similar:
 
 
 class _Pair(NamedTuple):
-    """What `_search` compares. fixed, moving: descriptions of two images, flat (n,); shape: (3,) of both; allowed: voxels
-    of the moving one that count; block: (m, 3) voxels about a middle one; offsets: (m,) the same in flat numbers.
+    """What `_search` compares. fixed, moving: descriptions of two images, flat (n,); shape: (3,) of both; allowed:
+    voxels of the moving one that count; block: (m, 3) voxels about a middle one; offsets: (m,) the same, flat.
     """
 
     fixed: Array
