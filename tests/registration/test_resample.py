@@ -82,10 +82,8 @@ def test_coarsening_keeps_linear_scenes_and_damps_waves_as_a_gaussian() -> None:
     assert_allclose(coarse.hu[core], expected[core], atol=1e-2)
     wave = image_of(lambda p: 100 * np.cos(2 * np.pi * p[:, 2] / 12), grid)
     damped = coarsen(wave, 3.0)
-    variance = (3.0**2 - 1.0**2) / 6
-    expected = (
-        100 * np.cos(2 * np.pi * damped.grid.points()[..., 2] / 12) * np.exp(-variance * (2 * np.pi / 12) ** 2 / 2)
-    )
+    variance, wave_number = (3.0**2 - 1.0**2) / 6, 2 * np.pi / 12
+    expected = 100 * np.cos(wave_number * damped.grid.points()[..., 2]) * np.exp(-variance * wave_number**2 / 2)
     assert_allclose(damped.hu[:, :, 3:-3], expected[:, :, 3:-3], atol=0.5)
 
 
