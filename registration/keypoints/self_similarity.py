@@ -86,8 +86,8 @@ def find_similar(fixed: Array, moving: Array, allowed: Array, starts: Array, rea
     around = np.full((n, 27), NO_COST, np.float32)
     _, nj, nk = fixed.shape
     offsets = (_BLOCK @ np.array([nj * nk, nk, 1])).astype(np.uint64)  # of unsigned indices numba asks no sign
-    flat = (np.ascontiguousarray(codes).ravel() for codes in (fixed, moving))
-    pair = _Pair(*flat, np.array(fixed.shape), np.ascontiguousarray(allowed), _BLOCK, offsets)
+    here, there = (np.ascontiguousarray(codes).ravel() for codes in (fixed, moving))
+    pair = _Pair(here, there, np.array(fixed.shape), np.ascontiguousarray(allowed), _BLOCK, offsets)
     _search(pair, np.ascontiguousarray(starts, np.int64), reach, best, shift, around)
     offset, is_top = subvoxel_peak(-around / NO_COST)
     return Similar(shift + offset, best[:, 0], best[:, 1], is_top)
