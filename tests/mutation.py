@@ -46,18 +46,18 @@ SCOPE: Scope = {
     "poro/**/*.py": (),
     "poro/contact/*.py": named("poro", "contact hertz"),
     "poro/mesh/*.py": (*named("poro", "mesh mesh_masks contact fit"), *named("vatsloc", "shuffled_nodes breathing")),
-    "vatsloc/case.py": named("vatsloc", "case marks new_case greyvalues dicom_regions"),
+    "vatsloc/case.py": named("vatsloc", "case case_refused marks new_case greyvalues dicom_regions"),
     "vatsloc/frames.py": (),
     "vatsloc/maps.py": (),
     "vatsloc/results.py": (),
     "vatsloc/evaluation/**/*.py": (),
     "vatsloc/formats/**/*.py": named(
         "vatsloc",
-        "formats_images formats_fields formats_folder formats_markups formats_meshes formats_transforms "
-        "malformed_images malformed_marks case marks results_roundtrip slicer_scene",
+        "formats_images formats_images_refused formats_fields formats_folder formats_markups formats_meshes "
+        "formats_transforms malformed_images malformed_marks case marks slicer_scene",
     ),
     "vatsloc/formats/dicom/*.py": named(
-        "vatsloc", "formats_dicom dicom_series dicom_pixels dicom_regions dicom_malformed marks"
+        "vatsloc", "formats_dicom dicom_files dicom_series dicom_pixels dicom_regions dicom_malformed marks"
     ),
     "vatsloc/imaging/**/*.py": named(
         "vatsloc",

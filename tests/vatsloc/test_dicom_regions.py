@@ -11,9 +11,9 @@ from pydicom.dataset import Dataset
 from pydicom.uid import generate_uid
 
 from registration.volume import Grid
+from tests.vatsloc.case_scene import ball, chest, grid_at, write_toml
 from tests.vatsloc.dicom_drawn import OBLIQUE, blob, grid, rectangle, segmentation, structures, written
 from tests.vatsloc.dicom_made import FRAME, ct_slice, save
-from tests.vatsloc.test_case import ball, chest, grid_at, write_toml
 from vatsloc.case import read_case
 from vatsloc.errors import InputRefused
 from vatsloc.formats.dicom.contours import even_odd

@@ -1,7 +1,5 @@
 """The nodule as users mark it: label images, segmentations, cropped masks, points; and what is refused."""
 
-# ruff: noqa: F401, F811  (the fixture `folder` comes from the tests of whole cases)
-
 from __future__ import annotations
 
 import json
@@ -12,7 +10,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from registration.volume import Grid, Mask
-from tests.vatsloc.test_case import CENTRE, ball, folder, grid_at, point, refused, write_toml
+from tests.vatsloc.case_scene import CENTRE, ball, grid_at, point, refused, whole_case, write_toml
 from vatsloc.case import read_case
 from vatsloc.errors import CaseError, InputRefused
 from vatsloc.formats.images import read_mask, read_region
@@ -22,6 +20,11 @@ from vatsloc.frames import flip_affine
 from vatsloc.marks import NoduleSource, read_nodule
 
 LUNG = np.array([-40.0, 0, 0])
+
+
+@pytest.fixture
+def folder(tmp_path) -> Path:
+    return whole_case(tmp_path)
 
 
 def label_map(path: Path, *masks: Mask) -> None:
@@ -134,6 +137,17 @@ def test_overlapping_segments_lie_in_layers(tmp_path):
     old = {"Name": "lung"}, {"Name": "nodule"}  # Slicer 4.10: neither values nor layers
     seg_nrrd(tmp_path / "old.seg.nrrd", layers, grid, *old)
     assert np.array_equal(read_region(tmp_path / "old.seg.nrrd", "nodule").inside, layers[1] == 1)
+
+
+@pytest.mark.parametrize("value", [1, 2])
+def test_two_segments_of_one_value_in_one_layer_are_refused(tmp_path, value):
+    """The lung would be read in the nodule's place."""
+    labels = np.zeros((1, 6, 6, 6), dtype=np.uint8)
+    labels[0, :4], labels[0, 2, 2, 2:4] = 1, 2
+    segments = [{"Name": name, "LabelValue": value, "Layer": 0} for name in ("lung", "nodule")]
+    seg_nrrd(tmp_path / "s.seg.nrrd", labels, Grid((6, 6, 6), np.eye(4)), *segments)
+    with pytest.raises(InputRefused, match=f'gives segments "lung" and "nodule" the same value {value} in one layer'):
+        read_region(tmp_path / "s.seg.nrrd", "nodule")
 
 
 def test_a_segmentation_without_voxels_is_refused(tmp_path):
