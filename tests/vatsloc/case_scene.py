@@ -62,7 +62,7 @@ def whole_case(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def refused(folder: Path, error: type[VatslocError], sentence: str) -> None:
+def check_refused(folder: Path, error: type[VatslocError], sentence: str) -> None:
     with pytest.raises(error, match=sentence) as caught:
         read_case(folder)
     assert "\n" not in str(caught.value)

@@ -10,7 +10,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from registration.volume import Mask, Volume
-from tests.vatsloc.case_scene import CENTRE, IMAGES, ball, chest, grid_at, point, refused, whole_case, write_toml
+from tests.vatsloc.case_scene import CENTRE, IMAGES, ball, check_refused, chest, grid_at, point, whole_case, write_toml
 from vatsloc.case import read_case
 from vatsloc.errors import CaseError, InputRefused
 from vatsloc.formats.meshes import write_stl
@@ -70,23 +70,23 @@ def folder(tmp_path) -> Path:
 )
 def test_wrong_case_files_are_refused(folder, tables, sentence):
     write_toml(folder, **tables)
-    refused(folder, CaseError, sentence)
+    check_refused(folder, CaseError, sentence)
 
 
 def test_folder_without_a_case_file_is_refused(tmp_path):
-    refused(tmp_path, CaseError, r"holds no case\.toml; name a case folder")
+    check_refused(tmp_path, CaseError, r"holds no case\.toml; name a case folder")
 
 
 def test_case_file_that_is_no_toml_is_refused(folder):
     (folder / "case.toml").write_text("side: right")
-    refused(folder, CaseError, r"case\.toml is not valid TOML")
+    check_refused(folder, CaseError, r"case\.toml is not valid TOML")
 
 
 def test_images_that_do_not_overlap_are_refused(folder):
     away = grid_at((400.0, 0, 0), n=(14, 14, 12))
     write_volume(folder / "cbct_inflated.nii.gz", Volume(chest(grid_at(n=(14, 14, 12))).hu, away.ras_from_ijk))
     sentence = r"overlap by 0 % \(400 mm between centres\), 20 % needed; place them within about 10 cm"
-    refused(folder, InputRefused, sentence)
+    check_refused(folder, InputRefused, sentence)
 
 
 def test_images_ten_centimetres_off_are_accepted(folder):
@@ -99,7 +99,7 @@ def test_images_ten_centimetres_off_are_accepted(folder):
 def test_image_that_is_not_in_hu_is_refused(folder):
     volume = chest(grid_at())
     write_volume(folder / "ct.nii.gz", Volume(volume.hu + 1024, volume.ras_from_ijk))
-    refused(
+    check_refused(
         folder, InputRefused, r"shows no air in HU \(its lowest percent starts at 24\) and cannot be .* state ct_slope"
     )
 
@@ -109,43 +109,45 @@ def test_image_with_a_voxel_that_is_not_a_number_is_refused(folder):
     values = np.asarray(image.dataobj, dtype=np.float32)
     values[3, 3, 3] = np.nan
     nibabel.save(nibabel.Nifti1Image(values, image.affine), folder / "cbct_deflated.nii.gz")
-    refused(folder, InputRefused, r"cbct_deflated\.nii\.gz has 1 voxels that are not finite numbers")
+    check_refused(folder, InputRefused, r"cbct_deflated\.nii\.gz has 1 voxels that are not finite numbers")
 
 
 def test_nodule_elsewhere_is_refused(folder):
     away = grid_at((500.0, 0, 0), spacing=2.0)
     write_mask(folder / "nodule.nii.gz", ball(away, centre=[500.0, 0, 0]))
-    refused(folder, InputRefused, r"nodule\.nii\.gz lies outside the CT; draw the mask in the CT's frame")
+    check_refused(folder, InputRefused, r"nodule\.nii\.gz lies outside the CT; draw the mask in the CT's frame")
     point(folder / "nodule_ct.mrk.json", [500.0, 0, 0])
     write_toml(folder, nodule={"point": "nodule_ct.mrk.json"})
-    refused(folder, InputRefused, r"nodule_ct\.mrk\.json lies outside the CT; save the point in the CT's frame")
+    check_refused(folder, InputRefused, r"nodule_ct\.mrk\.json lies outside the CT; save the point in the CT's frame")
 
 
 def test_nodule_point_far_from_its_mask_is_refused(folder):
     point(folder / "nodule_ct.mrk.json", -CENTRE)
     write_toml(folder, nodule={"mask": "nodule.nii.gz", "point": "nodule_ct.mrk.json"})
-    refused(folder, InputRefused, r"lies \d+ mm off the nodule mask nodule\.nii\.gz; keep the right one")
+    check_refused(folder, InputRefused, r"lies \d+ mm off the nodule mask nodule\.nii\.gz; keep the right one")
 
 
 def test_nodule_point_list_of_two_is_refused(folder):
     point(folder / "nodule_ct.mrk.json", CENTRE, CENTRE)
     write_toml(folder, nodule={"point": "nodule_ct.mrk.json"})
-    refused(folder, InputRefused, "holds 2 points, one needed; keep the nodule's centre")
+    check_refused(folder, InputRefused, "holds 2 points, one needed; keep the nodule's centre")
 
 
 def test_two_nodules_are_refused(folder):
     both = ball(grid_at()).inside | ball(grid_at(), centre=-CENTRE).inside
     write_mask(folder / "nodule.nii.gz", Mask(both, grid_at().ras_from_ijk))
-    refused(folder, InputRefused, "shows 2 separate regions, the largest of .*; keep one nodule per case")
+    check_refused(folder, InputRefused, "shows 2 separate regions, the largest of .*; keep one nodule per case")
 
 
 def test_mask_between_the_voxels_of_the_ct_is_refused(folder):
     centre = grid_at().to_ras(np.array([5.5, 5.5, 5.5]))
     write_mask(folder / "nodule.nii.gz", ball(grid_at(centre, spacing=0.5), centre=centre, radius=1.0))
-    refused(folder, InputRefused, "falls between them; draw it on the CT's grid")
+    check_refused(folder, InputRefused, "falls between them; draw it on the CT's grid")
 
 
 def test_deflated_surface_in_another_frame_is_refused(folder):
     write_stl(folder / "deflated.stl", np.array([[-90.0, 0, 0], [-80, 0, 0], [-90, 30, 0]]), np.array([[0, 1, 2]]))
     write_toml(folder, hints={"deflated_surface": "deflated.stl"})
-    refused(folder, InputRefused, "0 % of its points inside the deflated CBCT, 90 % needed; save it in LPS millimetres")
+    check_refused(
+        folder, InputRefused, "0 % of its points inside the deflated CBCT, 90 % needed; save it in LPS millimetres"
+    )

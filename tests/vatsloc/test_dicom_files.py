@@ -31,7 +31,7 @@ from vatsloc.formats.images import files_behind, read_volume, read_volume_and_wa
 AXIAL, OBLIQUE = np.eye(3), Rotation.from_rotvec([0.2, -0.3, 0.1]).as_matrix()
 
 
-def is_the_ramp(path: Path, series: str | None = None) -> None:
+def check_ramp(path: Path, series: str | None = None) -> None:
     volume = read_volume(path, series)
     assert volume.hu.shape == (NI, NJ, NK)
     assert_allclose(volume.hu, hu_at(volume.grid.points() * [-1, -1, 1]), atol=1e-3)
@@ -46,7 +46,7 @@ def concatenation(*orders: list[int]) -> list[Dataset]:
 
 
 def test_files_of_a_concatenation_are_one_volume(tmp_path):
-    is_the_ramp(save(tmp_path / "ct", concatenation([3, 0], [5, 1, 2], [4])))
+    check_ramp(save(tmp_path / "ct", concatenation([3, 0], [5, 1, 2], [4])))
 
 
 @pytest.mark.parametrize("there", [1, 2])
@@ -62,8 +62,8 @@ def test_a_concatenation_that_lacks_slices_is_refused_for_that(tmp_path):
 
 
 def test_multi_frame_files_whose_slices_continue_each_other_are_one_volume(tmp_path):
-    is_the_ramp(save(tmp_path / "ct", [enhanced(AXIAL, [3, 4, 5]), enhanced(AXIAL, [0, 1, 2])]))
-    is_the_ramp(save(tmp_path / "mixed", [enhanced(AXIAL, [1, 2, 3, 4, 5]), ct_slice(AXIAL, 0)]))
+    check_ramp(save(tmp_path / "ct", [enhanced(AXIAL, [3, 4, 5]), enhanced(AXIAL, [0, 1, 2])]))
+    check_ramp(save(tmp_path / "mixed", [enhanced(AXIAL, [1, 2, 3, 4, 5]), ct_slice(AXIAL, 0)]))
 
 
 @pytest.mark.parametrize(
@@ -79,7 +79,7 @@ def test_several_volumes_in_one_series_are_listed(tmp_path, second, listed):
     folder = save(tmp_path / "ct", [enhanced(AXIAL, list(range(NK))), *(enhanced(AXIAL, order) for order in second)])
     with pytest.raises(InputRefused, match=f"several volumes in one series: {listed}; name one file in"):
         read_volume(folder)
-    is_the_ramp(folder / "IM000")
+    check_ramp(folder / "IM000")
 
 
 def test_series_are_looked_for_in_folders_below(tmp_path):
@@ -89,7 +89,7 @@ def test_series_are_looked_for_in_folders_below(tmp_path):
     save(tmp_path / "export" / "study" / "upper", slices[3:])
     save(tmp_path / "export" / "study" / "lower", slices[:3])
     save(tmp_path / "export" / "study" / ".cache" / "again", slices)
-    is_the_ramp(tmp_path / "export")
+    check_ramp(tmp_path / "export")
     assert len(files_behind(tmp_path / "export")) == NK + 1
 
 
@@ -109,7 +109,7 @@ def test_series_in_folders_below_are_listed_and_chosen(tmp_path):
 def test_folders_below_slices_are_let_be(tmp_path):
     folder = save(tmp_path / "ct", [ct_slice(AXIAL, k) for k in range(NK)])
     save(folder / "derived", [ct_slice(AXIAL, k) for k in range(NK)])
-    is_the_ramp(folder)
+    check_ramp(folder)
 
 
 @pytest.mark.parametrize("axes", [AXIAL, OBLIQUE], ids=["axial", "oblique"])
