@@ -122,6 +122,22 @@ def evaluate(
 
 
 @app.command()
+def export_dicom(
+    result: Annotated[Path, typer.Argument(metavar="RESULT", help="Results folder of localize.")],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the DICOM files.")],
+    series: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="DICOM series of the deflated scan, where the case has it elsewhere."),
+    ] = None,
+) -> None:
+    """Write nodule, ellipsoid and lung as DICOM Segmentation, and a measurement report (extra "dicom")."""
+    from vatsloc.dicomout import export_result
+
+    for file in export_result(result, out, series):
+        print(file)
+
+
+@app.command()
 def cohort(
     folders: Annotated[
         list[Path], typer.Argument(metavar="DIR...", help="Case folders, or folders that hold case folders.")
