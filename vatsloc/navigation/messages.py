@@ -31,8 +31,9 @@ MOST_VOXELS = 65535
 def messages_of(result: Path, patient: str = "") -> list[bytes]:
     """Packed messages of a results folder; the scan is left out where its case is not there any more.
 
-    POINT `nodule`, TRANSFORM `DeflatedFromCT` (the spine's pose, CT to deflated scan), STRING `trust`, IMAGE `deflated`,
-    POLYDATA `ellipsoid95`, and STRING `patient` where the patient's ID is given. Raises CaseError where the folder is no result or pyigtl is not installed.
+    POINT `nodule`, TRANSFORM `DeflatedFromCT` (the spine's pose, CT to deflated scan), STRING `trust`, IMAGE
+    `deflated`, POLYDATA `ellipsoid95`, and STRING `patient` where the patient's ID is given. Raises CaseError where the
+    folder is no result or pyigtl is not installed.
     """
     require_pyigtl()
     import pyigtl
