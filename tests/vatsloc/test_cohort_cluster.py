@@ -58,7 +58,7 @@ def cluster() -> Iterator[LocalCluster]:
         yield made
 
 
-def until(what: Callable[[], bool], seconds: float = 60.0) -> None:
+def until(what: Callable[[], bool], seconds: float = 240.0) -> None:
     end = time.monotonic() + seconds
     while not what():
         assert time.monotonic() < end
@@ -84,11 +84,13 @@ def test_a_worker_killed_in_mid_run_costs_no_case(
         )
     )
     thread.start()
-    until(lambda: {"slow-1", "slow-2"} <= set(calls(tmp_path)))
-    os.kill(next(iter(pids.values())), signal.SIGKILL)
-    until(lambda: len([name for name in calls(tmp_path) if name.startswith("slow")]) >= 3)  # given to a worker again
-    (tmp_path / "go").touch()
-    thread.join(60)
+    try:
+        until(lambda: {"slow-1", "slow-2"} <= set(calls(tmp_path)))
+        os.kill(next(iter(pids.values())), signal.SIGKILL)
+        until(lambda: len([name for name in calls(tmp_path) if name.startswith("slow")]) >= 3)  # given out again
+    finally:
+        (tmp_path / "go").touch()
+        thread.join(240)
     assert [(o.name, o.exit_code) for o in outcomes] == [(case.name, 0) for case in cases]
     assert "4/4" in said[-1]
     for case in cases:
@@ -182,10 +184,12 @@ def test_the_program_is_the_worker_s_and_a_scheduler_that_dies_in_mid_run_is_nam
 
     thread = threading.Thread(target=run)
     thread.start()
-    until(lambda: "slow-2" in calls(tmp_path))
-    processes.scheduler.send_signal(signal.SIGKILL)
-    thread.join(60)
-    (tmp_path / "go").touch()
+    try:
+        until(lambda: "slow-2" in calls(tmp_path))
+        processes.scheduler.send_signal(signal.SIGKILL)
+        thread.join(240)
+    finally:
+        (tmp_path / "go").touch()
     assert isinstance(failed[0], CaseError)
     assert "stopped answering; start it and run again, what is done is kept" in str(failed[0])
     assert json.loads((tmp_path / "out" / "first" / "outcome.json").read_text())["exit_code"] == 0

@@ -23,6 +23,7 @@ from vatsloc.maps import covered, sampled
 from vatsloc.report.collect import report_data
 from vatsloc.report.data import LUNG, SURFACE, Outline, Picture
 from vatsloc.report.render import write_report
+from vatsloc.report.words import WORDS
 from vatsloc.results import OUTPUT_FILES, RADIUS95, REPORT, ResultData, RunRecord, write_inputs, write_results
 from vatsloc.slicer_scene import write_result_scenes
 from vatsloc.workflow.localization import Localization
@@ -304,17 +305,17 @@ def _pictures(case: Case, found: Localization) -> tuple[Picture, ...]:
     prepared, collapse = found.prepared, found.collapse
     return (
         Picture(
-            "Inflated lung as segmented",
-            "Lung in the inflated CBCT, after its cupping was taken away; planes through the nodule.",
+            WORDS["inflated_segmented"],
+            WORDS["inflated_segmented_says"],
             prepared.inflated.volume,
             found.nodule_inf,
-            (Outline("inflated lung", LUNG, found.pose.lung_inf),),
+            (Outline(WORDS["inflated_lung"], LUNG, found.pose.lung_inf),),
         ),
         Picture(
-            "Collapsed lung as segmented",
-            "What the model is fitted to: the lung beside the pleural air in the deflated CBCT.",
+            WORDS["collapsed_segmented"],
+            WORDS["collapsed_segmented_says"],
             prepared.deflated.volume,
             found.nodule_def,
-            (Outline("collapsed lung", SURFACE, collapse.observed.found.lung),),
+            (Outline(WORDS["collapsed_lung"], SURFACE, collapse.observed.found.lung),),
         ),
     )
