@@ -312,3 +312,28 @@ def test_is_dicom_tells_a_folder_of_slices_from_other_images(case: Path, tmp_pat
     assert not is_dicom(tmp_path)
     assert not is_dicom(tmp_path / "x.nii")
     assert not is_dicom(tmp_path / "absent")
+
+
+@pytest.mark.parametrize(
+    ("charset", "name", "sex"),
+    [
+        ("ISO_IR 100", "Müller^Jörg", "M"),
+        ("ISO_IR 192", "Müller^Jörg", "F"),
+        (["", "ISO 2022 IR 87"], "Yamada^Tarou=山田^太郎", "O"),
+        ("ISO_IR 192", "Doe^Jane", "X"),
+    ],
+)
+def test_patients_of_any_name_and_sex_get_their_objects(
+    charset: str | list[str], name: str, sex: str, tmp_path: Path
+) -> None:
+    folder = write_series(tmp_path / "series", scene.scan(), IDS)
+    for file in folder.iterdir():
+        ds = pydicom.dcmread(file)
+        ds.SpecificCharacterSet, ds.PatientName, ds.PatientSex = charset, name, sex
+        ds.save_as(file)
+    case = scene.write_case_file(tmp_path / "case")
+    result = scene.write_result(tmp_path / "result", case, scene.result())
+    for file in export_result(result, tmp_path / "out", folder):
+        ds = pydicom.dcmread(file)
+        assert str(ds.PatientName) == name
+        assert ds.PatientSex == (sex if sex in "MFO" else "")

@@ -47,6 +47,7 @@ def read_source(path: Path, series: str | int | None = None) -> SourceSeries:
         for name in NEEDED:
             if not header.text(name):
                 raise InputRefused(f"{header.file} states no {name}, so no object can refer to it; export it again.")
+        _make_plain(header.dataset)
     frames = sorted(frames_of(found.images, path), key=lambda frame: frame.place)
     lps_from_ijk = lattice(frames, path, found.left_out)
     first = frames[0].header
@@ -57,6 +58,15 @@ def read_source(path: Path, series: str | int | None = None) -> SourceSeries:
     else:
         images, order = tuple(frame.header.dataset for frame in frames), np.arange(len(frames))
     return SourceSeries(path, images, order, Grid(shape, flip_affine(lps_from_ijk)))
+
+
+def _make_plain(dataset: Dataset) -> None:
+    """Text in Unicode, and no sex that the standard does not know: objects that refer to a series repeat its patient,
+    and what writes them takes nothing else."""
+    dataset.decode()
+    dataset.SpecificCharacterSet = "ISO_IR 192"
+    if str(dataset.get("PatientSex") or "") not in ("M", "F", "O"):
+        dataset.PatientSex = ""
 
 
 @guarded("image")
