@@ -365,25 +365,34 @@ def test_a_patient_without_a_nodule_is_said_and_not_answered_with_another_s(
 def test_scans_are_prepared_before_the_deflated_one_comes(
     tmp_path: Path, scans: dict[str, dict[str, Path]], nodules: NoduleFiles
 ) -> None:
-    seen: list[tuple[str, bool]] = []
+    seen: list[str] = []
+    with_state: list[bool] = []
 
     def prepare(case: Path, state: Path) -> bool:
-        seen.append(((case / "case.toml").read_text(), state.exists()))
-        state.mkdir()
+        seen.append((case / "case.toml").read_text())
+        state.mkdir(exist_ok=True)
         return True
 
     def answer(case: Path, state: Path, out: Path) -> None:
-        assert state.is_dir()
+        with_state.append(state.is_dir())
+        if state.is_dir():
+            raise CaseError("the state is of another version of the program; prepare it again.")
         scene.fast_answer(case, state, out)
 
-    with scene.running(tmp_path / "cases", nodules, replace(scene.FAST_WORK, prepare=prepare, answer=answer)) as node:
-        assert scene.push(node.port, scans["A-1"]["ct"], scans["A-1"]["inflated"]) == 0
+    work = replace(scene.FAST_WORK, prepare=prepare, answer=answer)
+    with scene.running(tmp_path / "cases", nodules, work) as node:
+        assert scene.push(node.port, scans["A-1"]["ct"]) == 0
         node.wait_said("prepared in")
-        assert "cbct_inflated" in seen[0][0]
-        assert "cbct_deflated" not in seen[0][0]
+        assert scene.push(node.port, scans["A-1"]["inflated"]) == 0
+        node.wait_said("prepared in", times=2)
+    assert ["cbct_inflated" in text for text in seen] == [False, True]
+    assert not any("cbct_deflated" in text for text in seen)
+    with scene.running(tmp_path / "cases", nodules, work) as node:  # what was prepared is known after a restart
         assert scene.push(node.port, scans["A-1"]["deflated"]) == 0
         node.wait(lambda: len(node.results()) == 1)
-    assert len(seen) == 1
+        node.wait_said("not from what was prepared (the state is of another version of the program")
+    assert with_state == [True, False]  # a state that is refused costs no answer
+    assert len(seen) == 2
 
 
 def test_two_nodes_do_not_share_a_folder_or_a_port(tmp_path: Path, nodules: NoduleFiles) -> None:

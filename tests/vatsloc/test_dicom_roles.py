@@ -15,7 +15,7 @@ from vatsloc.dicomnet.nodule import NoduleFiles
 from vatsloc.dicomnet.roles import roles
 from vatsloc.dicomnet.sending import Target, target_of
 from vatsloc.dicomnet.store import Store
-from vatsloc.dicomnet.work import gas_of, localize_case, prepare_if_available
+from vatsloc.dicomnet.work import gas_of, localize_case, prepare_case
 from vatsloc.errors import CaseError
 
 
@@ -144,19 +144,13 @@ def test_the_real_work_raises_what_localize_says(tmp_path: Path) -> None:
     with pytest.raises(CaseError, match=r"holds no case\.toml; name a case folder"):
         localize_case(case, tmp_path / "state", tmp_path / "result", "fast")
     assert not (tmp_path / "result").exists()
+    with pytest.raises(CaseError, match=r"holds no case\.toml; name a case folder"):
+        prepare_case(case, tmp_path / "state", "fast")
+    assert (tmp_path / "prepare.log").exists()
 
 
 def test_gas_of_an_image_without_a_spine_is_not_known(tmp_path: Path) -> None:
     assert gas_of(write_series(tmp_path / "series", scan(), Ids())) is None
-
-
-def test_preparing_ahead_is_left_out_where_the_program_cannot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("vatsloc.workflow.prepare_case", None, raising=False)
-    assert prepare_if_available(tmp_path, tmp_path / "state") is False
-    made: list[tuple[Path, Path]] = []
-    monkeypatch.setattr("vatsloc.workflow.prepare_case", lambda case, state: made.append((case, state)), raising=False)
-    assert prepare_if_available(tmp_path, tmp_path / "state") is True
-    assert made == [(tmp_path, tmp_path / "state")]
 
 
 @pytest.mark.parametrize(

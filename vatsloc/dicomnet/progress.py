@@ -29,6 +29,8 @@ from vatsloc.formats.casefile import FILE_NAME
 from vatsloc.formats.folder import is_result, write_whole
 
 LONGEST_WAIT_S = 60.0
+PREPARED = "prepared.txt"
+"""The case file that a state was made of."""
 
 
 @dataclass
@@ -79,8 +81,8 @@ class Progress:
             sentence = f"no nodule is known of patient {patient.patient_id}; give one by --nodule."
             self._tell(f"{folder.name} nodule", f"{folder.name}: {sentence}")
             return {"nodule": sentence}
-        if known.inflated is not None:
-            self._prepare(folder / "before", known.ct, known.inflated, nodule)
+        if not known.deflated:
+            self._prepare(folder / "before", known, nodule)
         return {
             scan.folder.name: self._answer(
                 folder / "answers" / scan.folder.name, folder / "before", known, scan, nodule
@@ -88,25 +90,25 @@ class Progress:
             for scan in known.deflated
         }
 
-    def _prepare(self, before: Path, ct: Scan, inflated: Scan, nodule: Path) -> None:
-        """Once for each pair of scans, and again after a restart where nothing came of it."""
-        text = _case_text(before, {"ct": ct, "cbct_inflated": inflated}, nodule)
-        state = before / "state"
-        if _same(before / FILE_NAME, text):
-            if state.is_dir() or before in self._tried:
-                return
-        else:
-            shutil.rmtree(before, ignore_errors=True)
-            _write_case(before, text, nodule)
-        self._tried.add(before)
+    def _prepare(self, before: Path, known: Roles, nodule: Path) -> None:
+        """Once for the CT alone, again with the inflated scan; what did not succeed is tried again after a restart."""
+        text = _case_text(before, _before(known), nodule)
+        if text in (_text(before / PREPARED), self._told.get(f"{before} tried")):
+            return
+        self._told[f"{before} tried"] = text
+        _write_case(before, text, nodule)
         start = time.monotonic()
         try:
-            done = self.work.prepare(before, state)
+            if self.work.prepare(before, before / "state"):
+                write_whole(before / PREPARED, text)
+                self.say(f"{before.parent.name}: prepared in {time.monotonic() - start:.0f} s")
         except VatslocError as error:
             self._tell(str(before), f"{before.parent.name}: nothing prepared: {error}")
-            return
-        if done:
-            self.say(f"{before.parent.name}: prepared in {time.monotonic() - start:.0f} s")
+
+    def _state(self, before: Path, known: Roles, nodule: Path) -> Path:
+        """The state of these very scans; a path where nothing is, where there is none."""
+        fits = _text(before / PREPARED) == _case_text(before, _before(known), nodule)
+        return before / "state" if fits else before / "no-state"
 
     def _answer(self, folder: Path, before: Path, known: Roles, scan: Scan, nodule: Path) -> str:
         assert known.ct is not None
@@ -115,7 +117,7 @@ class Progress:
         result = folder / "result"
         images = {"ct": known.ct, "cbct_inflated": known.inflated, "cbct_deflated": scan}
         text = _case_text(folder, images, nodule)
-        if outcome.get("state") == "failed" and folder in self._tried and _same(folder / FILE_NAME, text):
+        if outcome.get("state") == "failed" and folder in self._tried and _text(folder / FILE_NAME) == text:
             return f"failed: {outcome['says']}"
         if outcome.get("state") != "answered" or not is_result(result):
             self._tried.add(folder)
@@ -123,7 +125,7 @@ class Progress:
             start = time.monotonic()
             self.say(f"{folder.parents[1].name}: answering")
             try:
-                self.work.answer(folder, before / "state", result)
+                self._localize(folder, self._state(before, known, nodule), result)
                 if not is_result(result):
                     raise CaseError(
                         f"{result} was not written; run it by hand: vatsloc localize {folder} --out {result}."
@@ -138,6 +140,17 @@ class Progress:
             patient = read_patient(folder.parents[1])
             self.publish(result, "" if patient is None else patient.patient_id)
         return self._send(folder, result)
+
+    def _localize(self, case: Path, state: Path, result: Path) -> None:
+        """Answer from a state; where that is refused, as after an update of the program, from the scans alone."""
+        try:
+            self.work.answer(case, state, result)
+        except CaseError as error:
+            if not state.is_dir():
+                raise
+            self.say(f"{case.parents[1].name}: not from what was prepared ({error}), so from the scans alone")
+            shutil.rmtree(state)
+            self.work.answer(case, state, result)
 
     def _send(self, folder: Path, result: Path) -> str:
         """Send once, again and again with longer and longer waits until the node takes it."""
@@ -196,8 +209,13 @@ def _case_text(folder: Path, images: dict[str, Scan], nodule: Path) -> str:
     return "\n".join(["[images]", *lines, "", "[nodule]", f"{kind} = {json.dumps(nodule.name)}", ""])
 
 
-def _same(file: Path, text: str) -> bool:
-    return file.is_file() and file.read_text(encoding="utf-8") == text
+def _before(known: Roles) -> dict[str, Scan]:
+    """The scans that need no deflated one, by their names in case.toml."""
+    return {n: s for n, s in (("ct", known.ct), ("cbct_inflated", known.inflated)) if s is not None}
+
+
+def _text(file: Path) -> str:
+    return file.read_text(encoding="utf-8") if file.is_file() else ""
 
 
 def _write_case(folder: Path, text: str, nodule: Path) -> None:

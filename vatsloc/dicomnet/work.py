@@ -9,11 +9,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-import vatsloc.workflow
 from vatsloc.errors import CaseError, InputRefused, NoAnswer, VatslocError
 
 EXITS: dict[int, type[VatslocError]] = {2: CaseError, 3: InputRefused, 4: NoAnswer}
-LOG = "localize.log"
 
 
 @dataclass(frozen=True)
@@ -28,8 +26,12 @@ class Work:
 
 
 def real_work(preset: str) -> Work:
-    """The program itself; answers are computed in a process of their own, so that no fault of one ends the node."""
-    return Work(gas_of, prepare_if_available, lambda case, state, out: localize_case(case, state, out, preset))
+    """The program itself, in processes of its own, so that no fault of one case ends the node."""
+    return Work(
+        gas_of,
+        lambda case, state: prepare_case(case, state, preset),
+        lambda case, state, out: localize_case(case, state, out, preset),
+    )
 
 
 def gas_of(slices: Path) -> dict[str, float] | None:
@@ -49,26 +51,29 @@ def gas_of(slices: Path) -> dict[str, float] | None:
         return None
 
 
-def prepare_if_available(case: Path, state: Path) -> bool:
-    """Prepare what has come of a case, where this program can do that ahead of the deflated scan."""
-    prepare: Callable[[Path, Path], None] | None = getattr(vatsloc.workflow, "prepare_case", None)
-    if prepare is None:
-        return False
-    prepare(case, state)
+def prepare_case(case: Path, state: Path, preset: str) -> bool:
+    """`vatsloc prepare`; its talk goes to a log beside the state. Raises the error that its exit code stands for."""
+    _run(["prepare", str(case), "--out", str(state), "--preset", preset], state.parent)
     return True
 
 
 def localize_case(case: Path, state: Path, out: Path, preset: str) -> None:
-    """`vatsloc localize` in a process of its own; its talk goes to a log beside the result.
+    """`vatsloc localize`, from a state where it is there; its talk goes to a log beside the result.
 
     Raises the error that its exit code stands for, with its last words.
     """
     ready = ["--state", str(state)] if state.is_dir() else []
-    command = [sys.executable, "-m", "vatsloc", "localize", str(case), "--out", str(out), "--preset", preset, *ready]
-    log = out.parent / LOG
+    _run(["localize", str(case), "--out", str(out), "--preset", preset, *ready], out.parent)
+
+
+def _run(arguments: list[str], folder: Path) -> None:
+    log = folder / f"{arguments[0]}.log"
     with log.open("wb") as talk:
+        command = [sys.executable, "-m", "vatsloc", *arguments]
         ended = subprocess.run(command, stdout=talk, stderr=talk, env=os.environ, check=False)
     if ended.returncode not in (0, 5):
         words = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
-        said = words[-1].removeprefix("vatsloc: ") if words else f"localize ended by {ended.returncode} without a word."
+        said = (
+            words[-1].removeprefix("vatsloc: ") if words else f"{arguments[0]} ended by {ended.returncode} in silence."
+        )
         raise EXITS.get(ended.returncode, NoAnswer)(said)

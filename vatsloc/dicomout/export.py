@@ -36,8 +36,8 @@ def export_result(result: Path, out: Path, series: Path | None = None) -> list[P
 def dicom_of_run(case: Path, result: ResultData) -> tuple[dict[str, Dataset], str]:
     """Objects of a run in memory by file name, and why there are none ("" also where the deflated scan is no DICOM)."""
     images = read_case_file(case).images
-    path = case / images.cbct_deflated
-    if not is_dicom(path):
+    path = case / (images.cbct_deflated or "")
+    if images.cbct_deflated is None or not is_dicom(path):
         return {}, ""
     try:
         require_highdicom()
@@ -76,6 +76,8 @@ def _source_of(result: Path) -> SourceSeries:
     if not (case / FILE_NAME).is_file():
         raise CaseError(f"the case of {result}, {case}, is not there any more; {ask}.")
     images = read_case_file(case).images
+    if images.cbct_deflated is None:
+        raise CaseError(f"{case / FILE_NAME} names no deflated scan any more; {ask}.")
     path = case / images.cbct_deflated
     if not path.exists():
         raise CaseError(f"{path}, the deflated scan of {result}, is not there any more; {ask}.")

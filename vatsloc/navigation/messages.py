@@ -101,8 +101,8 @@ def _scan(result: Path) -> tuple[Array, Array] | None:
     if case is None or not (case / FILE_NAME).is_file():
         return None
     images = read_case_file(case).images
-    path = case / images.cbct_deflated
-    if not path.exists():
+    path = case / (images.cbct_deflated or "")
+    if images.cbct_deflated is None or not path.exists():
         return None
     volume = read_volume(path, images.cbct_deflated_series)
     return (volume.hu, volume.ras_from_ijk) if max(volume.hu.shape) <= MOST_VOXELS else None

@@ -13,6 +13,7 @@ from vatsloc.errors import InputRefused
 from vatsloc.formats.dicom.frames import frames_of, lattice
 from vatsloc.formats.dicom.header import Header, read_header
 from vatsloc.formats.dicom.series import dicom_files, find_series, is_directory
+from vatsloc.formats.dicom.upright import is_tilted
 from vatsloc.formats.guard import guarded
 from vatsloc.frames import flip_affine
 
@@ -51,6 +52,13 @@ def read_source(path: Path, series: str | int | None = None) -> SourceSeries:
     frames = sorted(frames_of(found.images, path), key=lambda frame: frame.place)
     lps_from_ijk = lattice(frames, path, found.left_out)
     first = frames[0].header
+    if len(found.images) > 1 and len(frames) > len(found.images):
+        raise InputRefused(f"{path} has several multi-frame files, and no object can refer to them; export its slices.")
+    if is_tilted(lps_from_ijk):
+        raise InputRefused(
+            f"{path} has slices of a tilted gantry, which a run puts upright, so its result lies on other slices; "
+            "no object about them can be written."
+        )
     shape = (first.whole("Columns", 1, 65535), first.whole("Rows", 1, 65535), len(frames))
     images: tuple[Dataset, ...]
     if len(found.images) == 1:
