@@ -15,6 +15,7 @@ from registration.maps.field import DisplacementField
 from registration.spine import RigidFit
 from registration.volume import Array, Grid, Mask, Volume
 from vatsloc.case import Case, read_case
+from vatsloc.dicomout.export import dicom_of_run, write_objects
 from vatsloc.formats.folder import whole_folder
 from vatsloc.formats.meshes import Surface, TetraMesh
 from vatsloc.frames import flip_points
@@ -22,7 +23,8 @@ from vatsloc.maps import covered, sampled
 from vatsloc.report.collect import report_data
 from vatsloc.report.data import LUNG, SURFACE, Outline, Picture
 from vatsloc.report.render import write_report
-from vatsloc.results import OUTPUT_FILES, RADIUS95, REPORT, ResultData, RunRecord, write_results
+from vatsloc.report.words import WORDS
+from vatsloc.results import OUTPUT_FILES, RADIUS95, REPORT, ResultData, RunRecord, write_inputs, write_results
 from vatsloc.slicer_scene import write_result_scenes
 from vatsloc.workflow.localization import Localization
 from vatsloc.workflow.localize import localize
@@ -61,9 +63,15 @@ def run_case(
         found = localize(case, settings, stages, known)
         with stages.stage("warp"):
             fields = _fields(case, found)
+        result = _result(case, found, fields, _record(case, found, settings, stages))
         with stages.stage("write"):
-            result = _result(case, found, fields, _record(case, found, settings, stages))
+            objects, why = dicom_of_run(folder, result)
+            if why:
+                stages.warn(f"No DICOM objects were written: {why}")
+                result = replace(result, run=replace(result.run, warnings=tuple(stages.warnings)))
             write_results(partial, result)
+            write_objects(partial, objects)
+            write_inputs(partial, folder, out)
             write_result_scenes(partial, folder, out, result)
         with stages.stage("report"):
             write_report(partial / REPORT, report_data(case, result, _pictures(case, found)))
@@ -297,17 +305,17 @@ def _pictures(case: Case, found: Localization) -> tuple[Picture, ...]:
     prepared, collapse = found.prepared, found.collapse
     return (
         Picture(
-            "Inflated lung as segmented",
-            "Lung in the inflated CBCT, after its cupping was taken away; planes through the nodule.",
+            WORDS["inflated_segmented"],
+            WORDS["inflated_segmented_says"],
             prepared.inflated.volume,
             found.nodule_inf,
-            (Outline("inflated lung", LUNG, found.pose.lung_inf),),
+            (Outline(WORDS["inflated_lung"], LUNG, found.pose.lung_inf),),
         ),
         Picture(
-            "Collapsed lung as segmented",
-            "What the model is fitted to: the lung beside the pleural air in the deflated CBCT.",
+            WORDS["collapsed_segmented"],
+            WORDS["collapsed_segmented_says"],
             prepared.deflated.volume,
             found.nodule_def,
-            (Outline("collapsed lung", SURFACE, collapse.observed.found.lung),),
+            (Outline(WORDS["collapsed_lung"], SURFACE, collapse.observed.found.lung),),
         ),
     )
