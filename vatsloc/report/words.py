@@ -179,6 +179,8 @@ WORDS: Mapping[str, str] = {
     "in_radius": "Landmarks within their own 95 % radius",
     "in_radius_says": "{held} of {n} (median radius {mm} mm)",
     "by_depth": "By depth below the pleura in the CT",
+    "tissue_by_depth": "Tissue in view of both scans, by depth below the pleura in the CT",
+    "in_their_radius": "within their 95 % radius",
     "depth_mm": "depth, mm",
     "deeper": "{mm} and deeper",
     "depth_range": "{low} to {high}",

@@ -4,20 +4,23 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 import os
 import time
 from collections.abc import Sequence
 from concurrent.futures import Future, as_completed
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import jinja2
 
 from vatsloc.errors import CaseError
+from vatsloc.evaluation.evaluate import DENSE_DEPTHS_MM
 from vatsloc.formats.casefile import FILE_NAME
 from vatsloc.formats.folder import write_whole
 from vatsloc.results import REPORT
-from vatsloc.study.cohort.job import SILENT_MM, Job, NotSeen, Outcome, asked_of, kept_outcome, run_one
+from vatsloc.study.cohort.job import RIGHT_MM, SILENT_MM, Job, NotSeen, Outcome, asked_of, kept_outcome, run_one
 from vatsloc.study.cohort.pool import pool
 from vatsloc.workflow.stages import Say, quiet
 
@@ -131,10 +134,13 @@ def summary(outcomes: Sequence[Outcome]) -> str:
     held = [o.nodule_in_ellipsoid for o in outcomes if o.nodule_in_ellipsoid is not None]
     trusted = [o.nodule_in_ellipsoid for o in outcomes if o.exit_code == 0 and o.nodule_in_ellipsoid is not None]
     silent = [o.silent_failure for o in outcomes if o.silent_failure is not None]
+    alarms = [o.false_alarm for o in outcomes if o.false_alarm is not None]
     return (
         f"{len(outcomes)} cases, {sum(o.exit_code == 0 for o in outcomes)} with exit code 0. "
         f"The 95 % ellipsoid holds the nodule in {_of(held)} cases ({_of(trusted)} under exit code 0). "
         f"Their own 95 % radius holds {_sum(outcomes)} landmarks. "
+        f"{_tissue_in_radius(outcomes)}"
+        f"False alarms (a gate failed, yet nodule and tissue are right to {RIGHT_MM:g} mm on average): {_of(alarms)}. "
         f"Silent failures (nodule or mean landmark error over {SILENT_MM:g} mm under exit code 0): {_of(silent)}."
     )
 
@@ -150,10 +156,22 @@ def as_json(outcomes: Sequence[Outcome]) -> dict[str, Any]:
     }
 
 
+DEPTHS_MM = tuple(pairwise(DENSE_DEPTHS_MM))
+SHALLOW_MM = DEPTHS_MM[:2]
+"""Classes of depth that have columns of their own: where nodules lie that nobody can feel."""
 _HEADS = (
-    "case", "exit", *_PHASES.values(), "nodule", "ellipsoid holds it", "landmarks in their 95 % radius",
-    "failed gates", "s", "MB", "says"
-)  # fmt: skip
+    "case",
+    "exit",
+    *_PHASES.values(),
+    *(f"tissue {from_mm:g}-{to_mm:g} mm" for from_mm, to_mm in SHALLOW_MM),
+    "nodule",
+    "ellipsoid holds it",
+    "landmarks in their 95 % radius",
+    "failed gates",
+    "s",
+    "MB",
+    "says",
+)
 
 
 def _record(o: Outcome) -> dict[str, Any]:
@@ -162,10 +180,17 @@ def _record(o: Outcome) -> dict[str, Any]:
         "case": o.name,
         "exit_code": o.exit_code,
         **errors,
+        **{
+            f"tissue_{from_mm:g}_{to_mm:g}_{s}_mm": (o.tissue(from_mm) or {"chain": {s: None}})["chain"][s]
+            for from_mm, to_mm in SHALLOW_MM
+            for s in ("mean", "p95")
+        },
+        "tissue_in_view_mm": o.tissue_mm,
         "nodule_mm": o.nodule_mm,
         "nodule_in_ellipsoid95": o.nodule_in_ellipsoid,
         "landmarks_in_radius95": _share(o.landmarks_in_radius),
         "silent_failure": o.silent_failure,
+        "false_alarm": o.false_alarm,
         "failed_gates": " ".join(o.failed_gates),
         "seconds": round(o.seconds, 1),
         "peak_mb": round(o.peak_mb),
@@ -179,7 +204,9 @@ def _cells(o: Outcome) -> list[str]:
     says = "" if o.failed_gates else o.says.replace("|", "/")
     radius = "{} of {}".format(*o.landmarks_in_radius) if o.landmarks_in_radius[1] else ""
     tail = [radius, ", ".join(o.failed_gates), f"{o.seconds:.0f}", f"{o.peak_mb:.0f}", says]
-    return [o.name, str(o.exit_code), *phases, _number(o.nodule_mm), held, *tail]
+    classes = [o.tissue(from_mm) for from_mm, _ in SHALLOW_MM]
+    tissue = [" / ".join(_number(d["chain"][s]) for s in ("mean", "p95")) if d else "" for d in classes]
+    return [o.name, str(o.exit_code), *phases, *tissue, _number(o.nodule_mm), held, *tail]
 
 
 def _number(value: float | None) -> str:
@@ -197,6 +224,21 @@ def _share(counts: tuple[int, int]) -> float | None:
 def _sum(outcomes: Sequence[Outcome]) -> str:
     counts = [o.landmarks_in_radius for o in outcomes]
     return f"{sum(held for held, _ in counts)} of {sum(known for _, known in counts)}"
+
+
+def _tissue_in_radius(outcomes: Sequence[Outcome]) -> str:
+    """Sentence about the share of tissue within its 95 % radius, class of depth by class; empty without dense truth."""
+    parts = []
+    for from_mm, to_mm in DEPTHS_MM:
+        known = [d for d in (o.tissue(from_mm) for o in outcomes) if d and d["share_in_radius95"] is not None]
+        if known:
+            share = sum(d["share_in_radius95"] * d["n"] for d in known) / sum(d["n"] for d in known)
+            parts.append(
+                f"{100 * share:.1f} % at {from_mm:g} {f'to {to_mm:g} mm' if to_mm < math.inf else 'mm and deeper'}"
+            )
+    return (
+        f"Their own 95 % radius holds tissue in view by depth below the pleura: {', '.join(parts)}. " if parts else ""
+    )
 
 
 def _in_order(jobs: Sequence[Job], done: dict[str, Outcome]) -> list[Outcome]:

@@ -18,6 +18,8 @@ from vatsloc.formats.folder import RUN_FILE, write_whole
 OUTCOME_FILE = "outcome.json"
 SILENT_MM = 10.0
 """A nodule or a mean landmark error beyond this under exit code 0 is a silent failure."""
+RIGHT_MM = 3.0
+"""A nodule and tissue that are right to this on average do not deserve a failed gate."""
 TRIES = 2
 """How often a case is run that a signal ends, as memory that runs out does."""
 
@@ -68,6 +70,24 @@ class Outcome:
         """Wrong by more than `SILENT_MM` without a word; None where there is nothing to tell it by."""
         errors = [e for e in (self.phase("chain", "mean"), self.nodule_mm) if e is not None]
         return None if not errors else self.exit_code == 0 and max(errors) > SILENT_MM
+
+    @property
+    def false_alarm(self) -> bool | None:
+        """Marked by a gate although nodule and tissue in view are right to `RIGHT_MM` on average; None where there is
+        nothing to tell it by."""
+        errors = [e for e in (self.tissue_mm, self.nodule_mm) if e is not None]
+        return None if len(errors) < 2 else self.exit_code == 5 and max(errors) <= RIGHT_MM
+
+    @property
+    def tissue_mm(self) -> float | None:
+        """Mean error of the chain at tissue in view of both scans, mm; None without dense truth."""
+        dense = None if self.scores is None else self.scores.get("dense")
+        return None if dense is None else dense["inside_fov"]["chain"]["mean"]
+
+    def tissue(self, from_mm: float) -> dict[str, Any] | None:
+        """Errors of tissue of one class of depth, as in tre.json; None where there is none."""
+        dense = (None if self.scores is None else self.scores.get("dense")) or {"by_depth": []}
+        return next((d for d in dense["by_depth"] if d["from_mm"] == from_mm and d["n"]), None)
 
     @property
     def nodule_mm(self) -> float | None:
