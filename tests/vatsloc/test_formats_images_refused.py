@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import zlib
+
 import nibabel
 import nrrd
 import numpy as np
@@ -14,6 +16,7 @@ from tests.vatsloc.image_files import (
     affine_of,
     check_ramp,
     hu_at,
+    metaimage_header,
     write_mha,
     write_nii,
     write_nrrd,
@@ -250,3 +253,14 @@ def test_values_beyond_single_precision_are_refused(tmp_path):
     write_nii(tmp_path / "ct.nii", values, affine_of("LPS"))
     with pytest.raises(InputRefused, match="values beyond single precision; export it in Hounsfield units"):
         read_volume(tmp_path / "ct.nii")
+
+
+@pytest.mark.parametrize(("extra", "got"), [(-7, "473"), (7, "more than 480")])
+def test_compressed_voxels_of_another_number_are_refused(tmp_path, extra, got):
+    values = hu_at(Grid(SHAPE, affine_of("LPS")).points())
+    header = metaimage_header(values, affine_of("LPS"), CompressedData="True", ElementDataFile="ct.zraw")
+    (tmp_path / "ct.mhd").write_text(header)
+    voxels = values.tobytes(order="F")
+    (tmp_path / "ct.zraw").write_bytes(zlib.compress(voxels[:extra] if extra < 0 else voxels + bytes(extra)))
+    with pytest.raises(InputRefused, match=rf"ct\.zraw holds {got} bytes of voxels, 480 needed; copy or export"):
+        read_volume(tmp_path / "ct.mhd")
