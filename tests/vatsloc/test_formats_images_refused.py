@@ -8,6 +8,7 @@ import nibabel
 import nrrd
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from registration.volume import Grid
 from tests.vatsloc.image_files import (
@@ -97,12 +98,21 @@ def test_nifti_without_a_frame_is_refused(tmp_path):
         read_volume(tmp_path / "ct.nii")
 
 
-def test_nifti_whose_two_frames_disagree_is_refused(tmp_path):
+@pytest.mark.parametrize(
+    ("axes", "shift", "apart"),
+    [([-1, -1, 1], [0, 0, 0], 8), ([1, 1, 1], [3, -4, 12], 12), ([1, 1, 1], [0.5, -0.9, 0.9], 0)],
+)
+def test_nifti_whose_two_frames_disagree_is_refused(tmp_path, axes, shift, apart):
     image = nibabel.Nifti1Image(hu_at(Grid(SHAPE, np.eye(4)).points()), np.eye(4))
-    image.set_qform(np.diag([-1.0, -1.0, 1.0, 1.0]), code=1)
+    other = np.diag([*axes, 1.0])
+    other[:3, 3] = shift
+    image.set_qform(other, code=1)
     nibabel.save(image, tmp_path / "ct.nii")
-    with pytest.raises(InputRefused, match="two frames: qform and sform place the same voxel 8 mm apart"):
-        read_volume(tmp_path / "ct.nii")
+    if apart:
+        with pytest.raises(InputRefused, match=f"two frames: qform and sform place the same voxel {apart} mm apart"):
+            read_volume(tmp_path / "ct.nii")
+    else:
+        assert_array_equal(read_volume(tmp_path / "ct.nii").ras_from_ijk, np.eye(4))
 
 
 @pytest.mark.parametrize("unit", ["meter", "micron"])
