@@ -113,11 +113,14 @@ def test_time_axis_of_length_one_is_dropped(tmp_path, suffix):
     check_ramp(read_volume(tmp_path / f"ct.{suffix}"), "LPS")
 
 
-@pytest.mark.parametrize(("lowest", "stored"), [(-500.0, np.int16), (-40000.0, np.float32)])
-def test_written_volume_comes_back_on_its_grid(tmp_path, orientation, lowest, stored):
+@pytest.mark.parametrize(
+    ("one", "stored"),
+    [(-500.0, np.int16), (-32768.0, np.int16), (-32769.0, np.float32), (32767.0, np.int16), (32768.0, np.float32)],
+)
+def test_written_volume_comes_back_on_its_grid(tmp_path, orientation, one, stored):
     grid = Grid(SHAPE, affine_of(orientation))
     hu = np.rint(hu_at(grid.points()))
-    hu[0, 0, 0] = lowest
+    hu[0, 0, 0] = one
     write_volume(tmp_path / "out.nii.gz", Volume(hu, grid.ras_from_ijk))
     header = nibabel.load(tmp_path / "out.nii.gz").header
     assert header.get_data_dtype() == stored

@@ -213,7 +213,6 @@ def test_warped_ct_looks_like_the_deflated_cbct_in_the_lung(case: Path, result: 
     assert agreement > 0.8
 
 
-@pytest.mark.study
 def test_a_second_run_without_landmarks_and_truth_writes_the_same(case: Path, result: Path, tmp_path: Path) -> None:
     bare = tmp_path / "bare"
     shutil.copytree(case, bare)
