@@ -39,7 +39,7 @@ def folder(tmp_path) -> Path:
             r"\[images\] cbct_defalted is an unknown key",
         ),
         ({"images": {"ct": "ct.nii.gz", "cbct_inflated": "x"}}, r"\[images\] cbct_deflated is missing; add it"),
-        ({"side": "Right"}, "side = 'Right' is wrong .*'left' or 'right'"),
+        ({"side": "Right"}, r"side = 'Right' is wrong \(input should be 'left' or 'right'\); correct it"),
         ({"nodule": {}}, r"\[nodule\] names neither mask nor point; add mask"),
         ({"setup": {"pleural_gas": "helium"}}, r"\[setup\] pleural_gas = 'helium' is wrong"),
         ({"setup": {"gravity_cbct": [-1.0, 0.0]}}, r"\[setup\] gravity_cbct\[2\] is missing"),
