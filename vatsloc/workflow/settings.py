@@ -139,12 +139,14 @@ PRESETS: dict[str, dict[str, Any]] = {
     "fast": {
         "registration": {"grid_mm": 20.0, "levels": 3, "voxel_mm": 3.0},
         "mesh": {"edge_mm": 10.0, "model_edge_mm": 16.0},
+        "refinement": {"cell_mm": 8.0},
     },
     "balanced": {},
     "accurate": {
         "registration": {"grid_mm": 8.0, "levels": 5, "voxel_mm": 1.5},
         "mesh": {"edge_mm": 6.0},
         "residual": {"grid_mm": 10.0, "voxel_mm": 1.5},
+        "refinement": {"cell_mm": 4.0},
     },
     "auto": {"leave_out": {"first_registration_mm": 10.0, "residual_mm": 0.8}},
 }
