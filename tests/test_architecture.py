@@ -51,10 +51,14 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         "new_case": {"errors", "formats", "imaging", "case"},
         "results": {"frames", "formats"},
         "report": {"frames", "lazy", "formats", "case", "results"},
+        "dicomout": {"errors", "frames", "lazy", "maps", "formats", "case", "results", "report"},
+        "navigation": {"errors", "lazy", "formats", "results", "dicomout"},
         "slicer_scene": {"formats", "results", "report"},
         "workflow": {
             *("errors", "frames", "lazy", "maps", "formats", "imaging", "case", "results", "report", "slicer_scene"),
+            "dicomout",
         },
+        "dicomnet": {"errors", "lazy", "formats", "imaging", "workflow", "dicomout"},
         "evaluation": {"errors", "frames", "maps", "formats", "imaging", "case", "results", "report"},
         "synthetic": {"errors", "frames", "lazy", "formats", "imaging", "workflow"},
         "study": {
@@ -64,6 +68,7 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         "phantom_command": {"errors", "terminal", "synthetic", "study"},
         "cli": {
             *("errors", "terminal", "phantom_command", "new_case", "workflow", "evaluation", "synthetic", "study"),
+            *("dicomout", "dicomnet", "navigation"),
         },
         "__main__": {"cli"},
     },

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import os
 import platform
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -52,6 +53,8 @@ ANSWERED = (
     "scans",
 )
 """Keys of run.json that it holds."""
+INPUTS = "inputs.json"
+"""Where the case lies, relative to the results folder, for what needs the scans again; run.json holds no path."""
 RADIUS95 = "radius95_mm"
 """Of the nodes of `LUNG_DEFLATED`: how far off the tissue there may be, 95 %."""
 
@@ -76,6 +79,7 @@ OUTPUT_FILES = (
     RIGID_DEFLATED_FROM_INFLATED,
     RIGID_INFLATED_FROM_DEFLATED,
     RUN_FILE,
+    INPUTS,
     REPORT,
     SCENE,
     SCENE_WITH_SCANS,
@@ -213,6 +217,21 @@ def read_run(folder: Path) -> dict[str, Any]:
     """run.json of a results folder."""
     run: dict[str, Any] = json.loads((folder / RUN_FILE).read_text(encoding="utf-8"))
     return run
+
+
+def write_inputs(partial: Path, case: Path, folder: Path) -> None:
+    """Note in a result that is filled as `partial` and will lie in `folder` where its case is."""
+    relative = os.path.relpath(case.resolve(), folder.resolve())
+    (partial / INPUTS).write_text(json.dumps({"case": relative}) + "\n", encoding="utf-8")
+
+
+def case_of(folder: Path) -> Path | None:
+    """The case folder that a result was made from, None where it does not say."""
+    try:
+        relative = json.loads((folder / INPUTS).read_text(encoding="utf-8"))["case"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return Path(os.path.normpath(folder.resolve() / str(relative)))
 
 
 def versions() -> dict[str, str]:

@@ -67,7 +67,7 @@ class PleuralGas:
 def pleural_gas(inflated: tuple[PreparedCbct, Spine] | None, deflated: tuple[PreparedCbct, Spine]) -> PleuralGas:
     """Gas beside the lungs before and after the collapse, parted by the spine; none before it without a scan."""
     none: dict[Side, float] = {"right": 0.0, "left": 0.0}
-    return PleuralGas(none if inflated is None else _gas_ml(*inflated), _gas_ml(*deflated))
+    return PleuralGas(none if inflated is None else gas_ml(*inflated), gas_ml(*deflated))
 
 
 def nodule_side(ct: Volume, nodule: Mask | None, nodule_ras: Array | None) -> Side | None:
@@ -91,7 +91,7 @@ def nodule_side(ct: Volume, nodule: Mask | None, nodule_ras: Array | None) -> Si
     return nearest if clear else None
 
 
-def _gas_ml(cbct: PreparedCbct, spine: Spine) -> dict[Side, float]:
+def gas_ml(cbct: PreparedCbct, spine: Spine) -> dict[Side, float]:
     """Thick dark regions that no axial slice joins to the rim of the field of view, on either side of the spine."""
     work = working_copy(cbct.volume, SPACING_MM)
     spacing = work.grid.spacing

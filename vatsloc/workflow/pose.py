@@ -24,6 +24,7 @@ from vatsloc.imaging.thorax import carry_prior, inflated_lung, require_share, vi
 from vatsloc.maps import MeshMap
 from vatsloc.workflow.choices import Choice, weigh
 from vatsloc.workflow.prepare import PreparedBefore
+from vatsloc.workflow.refinement import BlockRefinement, Compared, Shape, refine_by_blocks
 from vatsloc.workflow.settings import RegistrationSettings, Settings
 from vatsloc.workflow.stages import CT, INFLATED, Stages
 
@@ -51,10 +52,9 @@ class ChangeOfPose:
     """The lung before its collapse. mesh_ct, points_inf: the same nodes in the CT and in the inflated CBCT, mm.
 
     rigid: None without an inflated CBCT; what stands in for it (vatsloc/workflow/stand_in.py) lies in the CT's frame.
-
-    ffd, its inversion at the nodes: None where the lung was left to the spine alone; extrapolation: None there too;
-    seen: (n,) nodes that the scanner saw; lung_inf: lung mask in the CBCT; overlap: share of the
-    lung in its field of view.
+    ffd, its inversion at the nodes: None where the lung was left to the spine alone; extrapolation: None there too, and
+    what it left before the refinement; seen: (n,) nodes that the scanner saw; lung_inf: lung mask in the CBCT; overlap:
+    share of the lung in its field of view; refinement: what blocks near the pleura added, None where it is off.
     """
 
     rigid: RigidFit | None
@@ -66,6 +66,7 @@ class ChangeOfPose:
     inversion: Inversion | None
     extrapolation: Extrapolation | None
     overlap: float
+    refinement: BlockRefinement | None = None
 
     @property
     def inf_from_ct_rigid(self) -> RigidTransform:
@@ -114,7 +115,7 @@ def change_of_pose(
     if not settings.registration.on:
         stages.skip("free-form deformation", "switched off in the settings")
         nowhere = np.zeros(len(mesh.points), dtype=bool)
-        return ChangeOfPose(rigid, None, lung_inf, mesh, placed.points, nowhere, None, None, overlap)
+        return ChangeOfPose(rigid, None, lung_inf, mesh, placed.points, nowhere, None, None, overlap, None)
     with stages.stage("free-form deformation"):
         ffd = register(
             prepared.inflated.volume,
@@ -134,16 +135,29 @@ def change_of_pose(
         settled = inversion.residual_mm < settings.gates.max_inversion_mm
         seen = _deep_inside(prepared.inflated.field.usable, inversion.points_fixed) & settled
         extension = continued(mesh, placed, inversion.points_fixed, seen, settled)
+    points, refinement = placed.points + extension.u, None
+    if settings.refinement.on:
+        with stages.stage("block refinement, inflated"):
+            to_inflated = MeshMap(mesh, points, inf_from_ct_rigid)
+            refinement = refine_by_blocks(
+                Compared(case.ct, prepared.lung_ct, prepared.inflated, lung_inf),
+                Shape(placed, to_inflated, np.flatnonzero(seen & (depth_of_nodes(mesh) > DEEP_MM)), DEEP_MM),
+                settings.refinement,
+            )
+        points = refinement.points
+    else:
+        stages.skip("block refinement, inflated", "switched off in the settings")
     return ChangeOfPose(
         rigid=rigid,
         ffd=ffd,
         lung_inf=lung_inf,
         mesh_ct=mesh,
-        points_inf=placed.points + extension.u,
+        points_inf=points,
         seen=seen,
         inversion=inversion,
         extrapolation=extension,
         overlap=overlap,
+        refinement=refinement,
     )
 
 
@@ -162,7 +176,7 @@ def continued(mesh: TetMesh, placed: TetMesh, points: Array, seen: Array, settle
     nodes; seen, settled: (n,) bool, in view; inverted. The elastic lung is first laid out by the best quadratic map of
     the nodes that are believed in full, since linear elasticity loses large rotations and strains.
     """
-    depth = -closest_points(mesh.boundary, mesh.points).distance
+    depth = depth_of_nodes(mesh)
     deep = np.clip((depth - SHALLOW_MM) / (DEEP_MM - SHALLOW_MM), 0, 1)
     told = SHALLOW * (SEEN / SHALLOW) ** deep
     weights = np.where(seen, told, np.minimum(told, UNSEEN))
@@ -171,6 +185,11 @@ def continued(mesh: TetMesh, placed: TetMesh, points: Array, seen: Array, settle
     found = extrapolate(laid_out, nodes, (points - laid_out.points)[nodes], Tissue(), weights[nodes])
     u = laid_out.points + found.u - placed.points
     return replace(found, u=u, det_f=signed_volumes(placed.points + u, mesh.tets) / placed.volumes)
+
+
+def depth_of_nodes(mesh: TetMesh) -> Array:
+    """Depth (n,) mm of a mesh's nodes below its surface."""
+    return -closest_points(mesh.boundary, mesh.points).distance
 
 
 def _laid_out(placed: TetMesh, points: Array, believed: Array) -> Array:

@@ -15,6 +15,7 @@ from registration.images.resample import resample_mask
 from registration.spine import RigidFit
 from registration.volume import Array, Mask, Volume
 from vatsloc.case import Case, read_case
+from vatsloc.dicomout.export import dicom_of_run, write_objects
 from vatsloc.formats.casefile import read_case_file
 from vatsloc.formats.folder import whole_folder
 from vatsloc.formats.meshes import Surface, TetraMesh
@@ -23,7 +24,17 @@ from vatsloc.maps import covered, sampled
 from vatsloc.report.collect import report_data
 from vatsloc.report.data import LUNG, SURFACE, Outline, Picture
 from vatsloc.report.render import write_report
-from vatsloc.results import RADIUS95, REPORT, ResultData, RunRecord, output_files, write_answer, write_results
+from vatsloc.report.words import WORDS
+from vatsloc.results import (
+    RADIUS95,
+    REPORT,
+    ResultData,
+    RunRecord,
+    output_files,
+    write_answer,
+    write_inputs,
+    write_results,
+)
 from vatsloc.slicer_scene import write_result_scenes
 from vatsloc.workflow.fields import Fields, fields_entry, fields_of, warped_ct
 from vatsloc.workflow.localization import Localization
@@ -31,6 +42,7 @@ from vatsloc.workflow.localize import localize
 from vatsloc.workflow.pneumothorax import contact_surface
 from vatsloc.workflow.pose import ChangeOfPose
 from vatsloc.workflow.quality import surface_distances
+from vatsloc.workflow.refinement import BlockRefinement
 from vatsloc.workflow.residual import Residual
 from vatsloc.workflow.settings import Settings
 from vatsloc.workflow.stages import Say, Stages, quiet
@@ -75,8 +87,14 @@ def run_case(
             fields = fields_of(case, found, settings.output.field_mm)
             result = _result(case, found, fields, record)
         with stages.stage("write"):
+            objects, why = dicom_of_run(folder, result)
+            if why:
+                stages.warn(f"No DICOM objects were written: {why}")
+            record = replace(record, warnings=tuple(stages.warnings))
             result = replace(result, run=_with_fields(record, fields, found, stages))
             write_results(partial, result)
+            write_objects(partial, objects)
+            write_inputs(partial, folder, out)
             write_result_scenes(partial, folder, out, result)
         with stages.stage("report"):
             write_report(partial / REPORT, report_data(case, result, _pictures(case, found)))
@@ -235,9 +253,14 @@ def _residuals(found: Localization) -> dict[str, Any]:
         "perturbation_ensemble": {"number": len(collapse.model.ensemble), "rms_mm_at_nodule": _scatter_mm(found)},
         "model_selection": [asdict(refinement) for refinement in collapse.model.refinements],
         "residual_registration": _corrected(collapse.residual),
+        "block_refinement": {"inflated": _passes(pose.refinement), "deflated": _passes(collapse.refinement)},
         "surface_mm": {f"p{share}": np.percentile(surface_distances(collapse), share) for share in (50, 75, 90, 95)},
         "mesh": {"tetrahedra": len(pose.mesh_ct.tets), "model_tetrahedra": len(collapse.system.mesh.tets)},
     }
+
+
+def _passes(refinement: BlockRefinement | None) -> list[dict[str, Any]] | None:
+    return None if refinement is None else [asdict(one) for one in refinement.passes]
 
 
 def _scatter_mm(found: Localization) -> float:
@@ -293,22 +316,19 @@ def _corrected(residual: Residual | None) -> dict[str, Any] | None:
 def _pictures(case: Case, found: Localization) -> tuple[Picture, ...]:
     """Intermediate results that a reader should see before trusting the last one."""
     prepared, collapse = found.prepared, found.collapse
-    caption = "Lung in the inflated CBCT, after its cupping was taken away; planes through the nodule."
-    if case.cbct_inflated is None:
-        caption = "No inflated CBCT was taken: the CT stands in for it, as the change of pose is expected to leave it."
     return (
         Picture(
-            "Inflated lung as segmented" if case.cbct_inflated is not None else "Inflated lung as expected",
-            caption,
+            WORDS["inflated_segmented" if case.cbct_inflated is not None else "inflated_expected"],
+            WORDS["inflated_segmented_says" if case.cbct_inflated is not None else "inflated_expected_says"],
             prepared.inflated.volume,
             found.nodule_inf,
-            (Outline("inflated lung", LUNG, found.pose.lung_inf),),
+            (Outline(WORDS["inflated_lung"], LUNG, found.pose.lung_inf),),
         ),
         Picture(
-            "Collapsed lung as segmented",
-            "What the model is fitted to: the lung beside the pleural air in the deflated CBCT.",
+            WORDS["collapsed_segmented"],
+            WORDS["collapsed_segmented_says"],
             prepared.deflated.volume,
             found.nodule_def,
-            (Outline("collapsed lung", SURFACE, collapse.observed.found.lung),),
+            (Outline(WORDS["collapsed_lung"], SURFACE, collapse.observed.found.lung),),
         ),
     )

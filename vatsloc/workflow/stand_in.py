@@ -56,7 +56,7 @@ def expected_pose(mesh: TetMesh, points: Array, ct: Grid) -> ChangeOfPose:
     margin = MARGIN_MM / ct.spacing
     box = ct.box(ijk.min(axis=0) - margin, ijk.max(axis=0) + 1 + margin).with_spacing(np.maximum(ct.spacing, VOXEL_MM))
     lung = covered(TetMesh(points, mesh.tets), box)
-    return ChangeOfPose(None, None, lung, mesh, points, nowhere, None, None, 1.0)
+    return ChangeOfPose(None, None, lung, mesh, points, nowhere, None, None, 1.0, None)
 
 
 def moved_ct(ct: Volume, inf_from_ct: MeshMap, grid: Grid) -> Volume:
