@@ -242,7 +242,7 @@ def test_the_evaluation_reads_each_truth_from_the_file_that_names_it(tmp_path: P
 
 
 def test_every_output_has_a_name_of_its_own() -> None:
-    assert len(set(results.OUTPUT_FILES)) == len(results.OUTPUT_FILES) == 23
+    assert len(set(results.OUTPUT_FILES)) == len(results.OUTPUT_FILES) == 24
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
