@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from vatsloc.case import Case
 from vatsloc.workflow.localization import Localization, checked, locate_nodule
+from vatsloc.workflow.parted import in_pieces
 from vatsloc.workflow.pneumothorax import pneumothorax
 from vatsloc.workflow.pose import change_of_pose
 from vatsloc.workflow.prepare import prepare
@@ -28,5 +29,6 @@ def localize(case: Case, settings: Settings, stages: Stages, state: State | None
     prepared = prepare(case, stages, known)
     pose = pose or change_of_pose(case, prepared, settings, stages)
     collapse = pneumothorax(case, prepared, pose, settings, stages)
+    pose, collapse = in_pieces(prepared, pose, collapse, settings, stages)
     found = locate_nodule(case, prepared, pose, collapse, settings, stages)
     return checked(case, found, settings, stages, left)

@@ -14,6 +14,7 @@ from registration.volume import Array
 from vatsloc.case import Case
 from vatsloc.maps import MeshMap
 from vatsloc.workflow.choices import weigh
+from vatsloc.workflow.fissures import Parted
 from vatsloc.workflow.model_selection import CollapseModel, select_model
 from vatsloc.workflow.observe import Observed, observe
 from vatsloc.workflow.pose import ChangeOfPose
@@ -32,7 +33,8 @@ class Collapse:
     """The lung after its collapse, in the deflated CBCT's frame.
 
     model: what mechanics made of the observations; residual: what images added to it; refinement: what small blocks of
-    the CT added to that, None where it is off; points_after: (n, 3) mm, nodes of `observed.mesh_before` after all.
+    the CT added to that, None where it is off; points_after: (n, 3) mm, nodes of `observed.mesh_before` after all; parted:
+    how the lung was cut, None for one piece.
     """
 
     observed: Observed
@@ -40,6 +42,7 @@ class Collapse:
     residual: Residual | None
     points_after: Array
     refinement: BlockRefinement | None = None
+    parted: Parted | None = None
 
     @property
     def def_from_inf_rigid(self) -> RigidTransform:
@@ -121,19 +124,24 @@ def _residual(
     seen = f"the model misses held-out keypoints by {misfit_mm:.2f} mm (median)"
     if not stages.choose(weigh(RESIDUAL, misfit_mm, settings.leave_out.residual_mm, seen)):
         return None
-    rigid, chosen = observed.def_from_inf_rigid, settings.residual
+    with stages.stage(RESIDUAL):
+        return residual_of_part(prepared, Collapse(observed, model, None, after), pose.mesh_inf, settings)
+
+
+def residual_of_part(prepared: Prepared, modelled: Collapse, mesh_inf: TetMesh, settings: Settings) -> Residual | None:
+    """What the images add to the model of a lung, or of a part of it whose mesh in the inflated CBCT is `mesh_inf`."""
+    model, rigid, chosen = modelled.model, modelled.def_from_inf_rigid, settings.residual
     if any(refinement.kept for refinement in model.refinements):
         chosen = chosen.model_copy(update={"levels": max(chosen.levels - 1, 1)})
-    with stages.stage(RESIDUAL):
-        return residual_registration(
-            prepared,
-            observed.found.lung,
-            MeshMap(pose.mesh_inf, after, rigid),
-            observed.mesh_before,
-            observed.surface,
-            chosen,
-            model.correspondences.mapped(moving=rigid.inverse()),
-        )
+    return residual_registration(
+        prepared,
+        modelled.observed.found.lung,
+        MeshMap(mesh_inf, modelled.points_after, rigid),
+        modelled.mesh_before,
+        modelled.observed.surface,
+        chosen,
+        model.correspondences.mapped(moving=rigid.inverse()),
+    )
 
 
 def contact_surface(collapse: Collapse) -> TriSurface:
