@@ -7,12 +7,10 @@
 from poro.mesh.closest import closest_points
 from poro.mesh.locate import interpolate, locate
 from poro.mesh.patches import patches, principal_axis
-from poro.mesh.pieces import Pieces, stuff_pieces
 from poro.mesh.stuffing import signed_distance, stuff, stuff_level_set
 from poro.mesh.tetmesh import TetMesh, TriSurface, quality, surface
 
 __all__ = [
-    "Pieces",
     "TetMesh",
     "TriSurface",
     "closest_points",
@@ -24,6 +22,5 @@ __all__ = [
     "signed_distance",
     "stuff",
     "stuff_level_set",
-    "stuff_pieces",
     "surface",
 ]

@@ -9,7 +9,8 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from poro.fem import Tissue, extrapolate
-from poro.mesh import Pieces, interpolate, locate, quality, stuff, stuff_pieces
+from poro.mesh import interpolate, locate, quality, stuff
+from poro.mesh.pieces import Pieces, stuff_pieces
 
 EDGE_MM, RADIUS_MM = 6.0, 30.0
 NORMAL = np.array([0.2, 0.6, 0.77])

@@ -28,7 +28,7 @@ def _scene(jump_mm: float, seed: int = 1, count: int = 400) -> tuple[np.ndarray,
 
 def test_keypoints_and_gas_tell_the_sheet() -> None:
     points, motion, gas = _scene(15.0)
-    found = find_fissure(points, motion, gas, HILUM)
+    found = find_fissure(points, motion, gas, HILUM, 5000)
     assert found is not None
     assert found.evidence == ("keypoints", "gas")
     clear = np.abs(TRUE.distance(points)) > 4.0
@@ -39,30 +39,30 @@ def test_keypoints_and_gas_tell_the_sheet() -> None:
 
 def test_a_lung_in_one_piece_gives_no_evidence() -> None:
     points, motion, _ = _scene(0.0)
-    found = find_fissure(points, motion, np.zeros((0, 3)), HILUM)
+    found = find_fissure(points, motion, np.zeros((0, 3)), HILUM, 5000)
     assert found is None or found.evidence == ()
 
 
 def test_gas_all_over_the_lung_is_no_evidence() -> None:
     points, motion, _ = _scene(15.0)
     gas = HILUM + np.random.default_rng(2).uniform(-1, 1, (300, 3)) * LUNG_MM
-    found = find_fissure(points, motion, gas, HILUM)
+    found = find_fissure(points, motion, gas, HILUM, 5000)
     assert found is not None
     assert found.evidence == ("keypoints",)
 
 
 def test_few_keypoints_tell_nothing() -> None:
     points, motion, gas = _scene(15.0, count=30)
-    assert find_fissure(points, motion, gas, HILUM) is None
+    assert find_fissure(points, motion, gas, HILUM, 0) is None
 
 
 @pytest.mark.parametrize(
     ("fissure", "evidence"),
     [
-        (Fissure(TRUE, 0.75, 40, 0.6), ("keypoints", "gas")),
-        (Fissure(TRUE, 0.76, 40, 0.6), ("gas",)),
-        (Fissure(TRUE, 0.75, 39, 0.6), ("keypoints",)),
-        (Fissure(TRUE, 0.75, 40, 0.59), ("keypoints",)),
+        (Fissure(TRUE, 0.75, 40, 0.6, 400), ("keypoints", "gas")),
+        (Fissure(TRUE, 0.76, 40, 0.6, 400), ("gas",)),
+        (Fissure(TRUE, 0.75, 39, 0.6, 400), ("keypoints",)),
+        (Fissure(TRUE, 0.75, 40, 0.59, 400), ("keypoints",)),
     ],
 )
 def test_evidence_has_limits(fissure: Fissure, evidence: tuple[str, ...]) -> None:
@@ -83,3 +83,10 @@ def test_a_smooth_map_is_followed_and_strays_are_not() -> None:
     wrong[::10] += 25.0
     told = mapped(smooth_map(points, wrong), points)
     assert np.linalg.norm(told - true, axis=1).max() < 1.0
+
+
+def test_gas_that_a_cut_explains_is_taken_off() -> None:
+    found = Fissure(TRUE, 0.5, 60, 0.75, 300)
+    assert found.unexplained(False) == pytest.approx(0.2)
+    assert found.unexplained(True) == pytest.approx(0.05)
+    assert Fissure(TRUE, 0.5, 0, 0.0, 0).unexplained(False) == 0

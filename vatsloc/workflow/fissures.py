@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import minimize
 
-from poro.mesh import Pieces
+from poro.mesh.pieces import Pieces
 from registration.volume import Array
 
 SCALE_MM = 60.0
@@ -58,13 +58,19 @@ class Sheet:
 @dataclass(frozen=True)
 class Fissure:
     """A sheet along which the lung may have parted. cost_share: cost of two smooth maps of the keypoints' motion over
-    that of one; gas: how many points of gas came into the lung; gas_share: of them, those that lie beside the sheet.
+    that of one; gas: how many points of gas came into the lung; gas_share: of them, those that lie beside the sheet;
+    border: of how many points of the gas's border it is known where they came from.
     """
 
     sheet: Sheet
     cost_share: float
     gas: int
     gas_share: float
+    border: int
+
+    def unexplained(self, is_cut: bool) -> float:
+        """Share of the gas's border that came from inside the lung and, if the lung is cut, not from the sheet."""
+        return self.gas * (1 - self.gas_share * is_cut) / max(self.border, 1)
 
     @property
     def evidence(self) -> tuple[str, ...]:
@@ -85,9 +91,9 @@ class Parted:
         return {"n": 2, "fissures": [{"between": ["above", "below"], "evidence": list(self.fissure.evidence)}]}
 
 
-def find_fissure(points: Array, motion: Array, gas: Array, hilum: Array) -> Fissure | None:
+def find_fissure(points: Array, motion: Array, gas: Array, hilum: Array, border: int) -> Fissure | None:
     """The sheet that best tells keypoints (n, 3) of the CT apart by their motion (n, 3) mm, and gas (k, 3), where it
-    came from, from the rest of the lung. None where there are too few keypoints on its sides.
+    came from, from the rest of the lung. border: as in `Fissure`. None where there are too few keypoints on its sides.
     """
     scene = _Scene(points, motion, gas, hilum)
     one = _misfit(_terms(points - hilum), motion)
@@ -109,7 +115,8 @@ def find_fissure(points: Array, motion: Array, gas: Array, hilum: Array) -> Fiss
         return None
     sheet = Sheet(hilum, best)
     beside = np.abs(sheet.distance(gas)) < BESIDE_MM
-    return Fissure(sheet, scene.motion_cost(best) / max(one, 1e-9), len(gas), float(beside.mean()) if len(gas) else 0.0)
+    share = float(beside.mean()) if len(gas) else 0.0
+    return Fissure(sheet, scene.motion_cost(best) / max(one, 1e-9), len(gas), share, border)
 
 
 @dataclass(frozen=True)

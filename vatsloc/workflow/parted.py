@@ -15,7 +15,8 @@ from scipy.spatial import cKDTree
 
 from poro.fem import Tissue
 from poro.fit import Target, constraints_to, elastic_correction
-from poro.mesh import Pieces, TetMesh, closest_points, interpolate, locate, stuff_pieces
+from poro.mesh import TetMesh, closest_points, interpolate, locate
+from poro.mesh.pieces import Pieces, stuff_pieces
 from registration.correspondences import Correspondences
 from registration.images.resample import resample_mask
 from registration.volume import Array, Mask
@@ -63,12 +64,12 @@ def in_pieces(
         fissure = seen_fissure(pose, collapse)
     if fissure is None or len(fissure.evidence) < 2:
         stages.skip(PIECES, _why(fissure))
-        return pose, collapse
+        return pose, replace(collapse, fissure=fissure)
     with stages.stage(f"{PIECES}, fit"):
         fitted = _fitted(prepared, pose, collapse, fissure, settings)
     if fitted is None:
         stages.skip(PIECES, "held-out keypoints are not predicted better by a lung in two pieces")
-        return pose, collapse
+        return pose, replace(collapse, fissure=fissure)
     pose, collapse = fitted
     if not settings.residual.on:
         return pose, collapse
@@ -89,7 +90,7 @@ def seen_fissure(pose: ChangeOfPose, collapse: Collapse) -> Fissure | None:
     came_from = air[known] + (found.moving - found.fixed)[near[known]].mean(axis=1)
     gas = interpolate(locate(before, came_from), pose.mesh_ct.points)
     deep = -closest_points(pose.mesh_ct.boundary, gas).distance > LEAST_DEEP_MM
-    return find_fissure(points, found.fixed - found.moving, gas[deep], hilum[0])
+    return find_fissure(points, found.fixed - found.moving, gas[deep], hilum[0], len(gas))
 
 
 def _why(fissure: Fissure | None) -> str:
@@ -148,7 +149,9 @@ def _fitted(
         observed=replace(observed, mesh_before=rest_fine),
         model=replace(model, refinements=(*model.refinements, refinement), ensemble=ensemble),
         residual=None,
+        refinement=None,
         points_after=after,
+        fissure=fissure,
         parted=Parted(fissure, fine),
     )
 

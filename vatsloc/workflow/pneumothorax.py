@@ -14,7 +14,7 @@ from registration.volume import Array
 from vatsloc.case import Case
 from vatsloc.maps import MeshMap
 from vatsloc.workflow.choices import weigh
-from vatsloc.workflow.fissures import Parted
+from vatsloc.workflow.fissures import Fissure, Parted
 from vatsloc.workflow.model_selection import CollapseModel, select_model
 from vatsloc.workflow.observe import Observed, observe
 from vatsloc.workflow.pose import ChangeOfPose
@@ -33,8 +33,9 @@ class Collapse:
     """The lung after its collapse, in the deflated CBCT's frame.
 
     model: what mechanics made of the observations; residual: what images added to it; refinement: what small blocks of
-    the CT added to that, None where it is off; points_after: (n, 3) mm, nodes of `observed.mesh_before` after all; parted:
-    how the lung was cut, None for one piece.
+    the CT added to that, None where it is off; points_after: (n, 3) mm, nodes of `observed.mesh_before` after all;
+    fissure: the sheet along which it may have parted, None where that was not looked for; parted: how it was cut, None
+    for one piece.
     """
 
     observed: Observed
@@ -42,6 +43,7 @@ class Collapse:
     residual: Residual | None
     points_after: Array
     refinement: BlockRefinement | None = None
+    fissure: Fissure | None = None
     parted: Parted | None = None
 
     @property
