@@ -23,7 +23,8 @@ from registration.volume import Array, Mask
 from vatsloc.imaging.surface import Border
 from vatsloc.maps import MeshMap, covered
 from vatsloc.workflow.fissures import LEAST_DEEP_MM, Fissure, Parted, find_fissure, mapped, smooth_map
-from vatsloc.workflow.model_selection import GAIN, Refinement, fit_settings, held_out, misfit
+from vatsloc.workflow.hold_out import held_out
+from vatsloc.workflow.model_selection import GAIN, Refinement, fit_settings, misfit
 from vatsloc.workflow.observe import Observed
 from vatsloc.workflow.pneumothorax import Collapse, residual_of_part
 from vatsloc.workflow.pose import ChangeOfPose
