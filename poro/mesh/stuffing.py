@@ -60,6 +60,14 @@ def stuff(inside: Array, ras_from_ijk: Array, edge_mm: float) -> TetMesh:
 
     Raises ValueError when the mask is empty or too thin to hold one element, or when an angle falls below 8 degrees.
     """
+    return stuff_level_set(*mask_level(inside, ras_from_ijk, edge_mm), edge_mm)
+
+
+def mask_level(inside: Array, ras_from_ijk: Array, edge_mm: float) -> tuple[Callable[[Array], Array], Array, Array]:
+    """Level that `stuff` fills for a mask, positive inside, and the corners (3,) mm of the box that holds it.
+
+    Raises ValueError when the mask is empty or the edge is not positive.
+    """
     if not edge_mm > 0:
         raise ValueError(f"edge_mm must be positive, got {edge_mm}")
     step = edge_mm / 4
@@ -72,7 +80,7 @@ def stuff(inside: Array, ras_from_ijk: Array, edge_mm: float) -> TetMesh:
 
     lower = affine[:3, 3]
     upper = lower + (np.array(distance.shape) - 1) * step
-    return stuff_level_set(level, lower, upper, edge_mm)
+    return level, lower, upper
 
 
 def stuff_level_set(level: Callable[[Array], Array], lower: Array, upper: Array, edge_mm: float) -> TetMesh:

@@ -41,7 +41,7 @@ SAYS = {
     "registration_folds": "folds space",
     "inverted_elements": "inside out",
     "deflated_surface": "Too little of the collapsed lung",
-    "fissures": "Lobes have come apart",
+    "fissures": "Gas lies where the lung was",
     "surface": "stays off the observed one",
     "held_out": "does not predict",
     "agreement": "disagree",

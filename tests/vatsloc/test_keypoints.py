@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -10,7 +11,8 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from registration.correspondences import Correspondences
-from registration.volume import Array
+from registration.images.resample import resample_mask
+from registration.volume import Array, Mask
 from tests.vatsloc import ball_scene as scene
 from vatsloc.maps import MeshMap
 from vatsloc.workflow import keypoints as module
@@ -80,6 +82,7 @@ def test_propagation_gets_both_images_in_one_frame_and_the_lung_of_each(
 
     monkeypatch.setattr(module, "match_keypoints", match)
     monkeypatch.setattr(module, "propagate_matches", propagate)
+    monkeypatch.setattr(module, "FEW", 30)
     found = find_correspondences(half_seen(), observed, model, KeypointSettings(voxel_mm=2.0, reach_mm=9.0))
     # The model takes 60 % of an affine collapse: its inverse is affine too.
     gradient = np.eye(3) + 0.6 * (scene.SQUEEZE - np.eye(3))
@@ -112,6 +115,36 @@ def test_propagation_gets_both_images_in_one_frame_and_the_lung_of_each(
     assert 1.0 < depth_before(scene.expanded(points)).min() < 4.0
     assert PLANE_DEF - 4.0 < points[:, 2].max() < PLANE_DEF + 2.0
     assert points[:, 2].min() < PLANE_DEF - 30.0
+
+
+@pytest.mark.parametrize("few", [30, 31])
+def test_where_few_are_found_more_are_looked_for_in_all_tissue(
+    observed: Any, monkeypatch: pytest.MonkeyPatch, few: int
+) -> None:
+    """Half of the collapsed lung was not taken for lung, as where it has lost its air."""
+    found = observed.found
+    half = found.lung.grid.points()[..., 0] < scene.CENTRE_DEF[0]
+    observed.found = replace(found, lung=Mask(found.lung.inside & half, found.lung.ras_from_ijk))
+    calls: list[tuple[Any, float]] = []
+    inner = scene.CENTRE_DEF + np.random.default_rng(1).uniform(-9, 9, (30, 3))
+
+    def propagate(fixed: Any, moving: Any, after: Any, before: Any, seeds: Any, settings: Any) -> Correspondences:
+        calls.append((after, settings.match.cell_mm))
+        return seeds
+
+    monkeypatch.setattr(module, "match_keypoints", lambda *_, **__: Correspondences.of(inner, inner))
+    monkeypatch.setattr(module, "propagate_matches", propagate)
+    monkeypatch.setattr(module, "FEW", few)
+    find_correspondences(scene.prepared(), observed, np.zeros_like(observed.model_mesh.points), KeypointSettings())
+    assert [cell for _, cell in calls] == ([10.0] if few == 30 else [10.0, 7.0])
+    first = calls[0][0].grid.points()[calls[0][0].inside]
+    assert first[:, 0].max() < scene.CENTRE_DEF[0]
+    if few == 31:
+        every = calls[1][0].grid.points()[calls[1][0].inside]
+        assert every[:, 0].max() > scene.CENTRE_DEF[0] + 10
+        assert len(every) > 1.6 * len(first)
+        gas = resample_mask(found.air, calls[1][0].grid).inside
+        assert not (gas & calls[1][0].inside).any()
 
 
 def test_under_the_right_map_both_images_show_the_same(observed: Any) -> None:

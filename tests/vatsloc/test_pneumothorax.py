@@ -16,7 +16,7 @@ from registration.volume import Array
 from tests.vatsloc import ball_scene as scene
 from vatsloc.workflow import pneumothorax as module
 from vatsloc.workflow.model_selection import CollapseModel, Refinement
-from vatsloc.workflow.pneumothorax import REFINEMENT, RESIDUAL, Collapse, collapse, contact_surface, pneumothorax
+from vatsloc.workflow.pneumothorax import REFINEMENT, RESIDUAL, Collapse, collapse, contact_surface, pneumothorax, refined
 from vatsloc.workflow.pose import ChangeOfPose
 from vatsloc.workflow.refinement import BlockRefinement, Compared, Shape
 from vatsloc.workflow.residual import Residual
@@ -85,7 +85,8 @@ class Parts:
         monkeypatch.setattr(module, "refine_by_blocks", refine)
         monkeypatch.setattr(module, "select_model", select_model)
         monkeypatch.setattr(module, "residual_registration", correct)
-        return collapse(case, self.prepared, self.pose, self.observed, settings, self.stages)
+        found = collapse(case, self.prepared, self.pose, self.observed, settings, self.stages)
+        return refined(case, self.prepared, self.pose, found, settings, self.stages)
 
 
 def correction(parts: Parts) -> Residual:

@@ -49,7 +49,10 @@ class SurfacePoints:
 
     def only(self, *borders: Border) -> SurfacePoints:
         """The points with one of `borders`."""
-        keep = np.isin(self.border, borders)
+        return self.where(np.isin(self.border, borders))
+
+    def where(self, keep: Array) -> SurfacePoints:
+        """The points that `keep` (n,) bool says."""
         return SurfacePoints(self.points[keep], self.normals[keep], self.confidence[keep], self.border[keep])
 
 

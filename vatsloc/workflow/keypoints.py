@@ -1,12 +1,14 @@
 """Keypoints inside the lung matched between both cone-beam CTs: first about where a model of the collapse puts them,
-then by propagation from the matches to their neighbours.
+then by propagation from the matches to their neighbours. Where these are few, tissue without air is searched too.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from poro.mesh import TetMesh
 from registration.correspondences import Correspondences
-from registration.images.morphology import erode
+from registration.images.morphology import dilate, erode
 from registration.images.resample import coarsen, resample_mask
 from registration.keypoints.matching import MatchSettings, match_keypoints
 from registration.keypoints.propagation import PropagationSettings, propagate_matches
@@ -19,6 +21,14 @@ from vatsloc.workflow.warped_pair import warped_pair
 
 RIM_MM = 2.0
 """Blocks nearer than this to the lung's border also show what lies beyond it."""
+FEW = 400
+"""With fewer keypoints than this, more are looked for: in airless tissue, and one in every smaller cell."""
+SHRUNK_CELL_MM = 7.0
+"""What a cell of 10 mm becomes where the lung has shrunk to a third."""
+ROOM_MM, AIRLESS_MM, GAS_RIM_MM = 6.0, 25.0, 1.5
+"""Tissue is looked for so far beyond where the inflated lung was, so far from gas and aerated lung, and not so near to
+gas, where a voxel holds both."""
+BONE_HU = 150.0
 
 
 def find_correspondences(
@@ -36,11 +46,24 @@ def find_correspondences(
         covered(observed.mesh_before, placed.grid),
         resample_mask(prepared.inflated.field.usable, inflated.grid).inside,
     )
-    after = _inner(
-        resample_mask(observed.found.lung, deflated.grid),
-        resample_mask(prepared.deflated.field.usable, deflated.grid).inside,
-    )
-    return propagate_matches(deflated, placed, after, before, first, PropagationSettings(match))
+    seen = resample_mask(prepared.deflated.field.usable, deflated.grid).inside
+    after = _inner(resample_mask(observed.found.lung, deflated.grid), seen)
+    found = propagate_matches(deflated, placed, after, before, first, PropagationSettings(match))
+    if len(found) >= FEW:
+        return found
+    after, finer = _inner(tissue(prepared, observed, deflated), seen), replace(match, cell_mm=SHRUNK_CELL_MM)
+    return propagate_matches(deflated, placed, after, before, found, PropagationSettings(finer))
+
+
+def tissue(prepared: Prepared, observed: Observed, deflated: Volume) -> Mask:
+    """What may be lung on the grid of a deflated CBCT, airless parts included: all that is neither gas nor bone where
+    the inflated lung was, near the collapsed lung's space. Mediastinum and diaphragm that moved there are in it too.
+    """
+    grid, found = deflated.grid, observed.found
+    gas, space = (resample_mask(mask, grid).inside for mask in (found.air, found.space))
+    room = dilate(covered(observed.mesh_before, grid).inside, ROOM_MM, grid.spacing)
+    room &= dilate(space, AIRLESS_MM, grid.spacing) & ~dilate(gas, GAS_RIM_MM, grid.spacing)
+    return Mask(room & (deflated.hu > found.limit_hu) & (deflated.hu < BONE_HU), grid.ras_from_ijk)
 
 
 def _near_model(prepared: Prepared, observed: Observed, displacement: Array, match: MatchSettings) -> Correspondences:

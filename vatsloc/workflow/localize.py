@@ -2,7 +2,8 @@
 
 `before_collapse` does what needs no deflated scan: it reads lungs, airways and spines off the CT and the inflated
 cone-beam CT, and finds the change of pose between them, phase 1. Without an inflated scan `stand_in` expects both from
-the CT. `prepare` reads off the deflated scan. `pneumothorax` is phase 2, from the inflated to the deflated lung.
+the CT. `prepare` reads off the deflated scan. `pneumothorax` is phase 2, from the inflated to the deflated lung;
+`in_pieces` cuts a lung whose lobes came apart; `refined` makes it follow small blocks of the CT up to the pleura.
 `locate_nodule` carries the nodule through both and says how uncertain it is. `checked` compares the result with the
 scans by keypoints that nothing before it has used.
 """
@@ -12,7 +13,8 @@ from __future__ import annotations
 from vatsloc.case import Case
 from vatsloc.workflow.localization import Localization, checked, locate_nodule
 from vatsloc.workflow.observe import spine_from_ct
-from vatsloc.workflow.pneumothorax import pneumothorax
+from vatsloc.workflow.parted import in_pieces
+from vatsloc.workflow.pneumothorax import pneumothorax, refined
 from vatsloc.workflow.prepare import prepare
 from vatsloc.workflow.settings import Settings
 from vatsloc.workflow.stages import Stages
@@ -30,5 +32,7 @@ def localize(case: Case, settings: Settings, stages: Stages, state: State | None
     prepared = prepare(case, stages, before)
     spine = None if known.complete else spine_from_ct(case, prepared, stages)
     collapse = pneumothorax(case, prepared, pose, settings, stages, spine)
+    pose, collapse = in_pieces(prepared, pose, collapse, settings, stages)
+    collapse = refined(case, prepared, pose, collapse, settings, stages)
     found = locate_nodule(case, prepared, pose, collapse, settings, stages)
     return checked(case, found, settings, stages, known.left_over)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from registration.volume import Array
 from vatsloc.case import Case
 from vatsloc.maps import MeshMap
 from vatsloc.workflow.choices import weigh
+from vatsloc.workflow.fissures import Fissure, Parted
 from vatsloc.workflow.model_selection import CollapseModel, select_model
 from vatsloc.workflow.observe import Observed, observe
 from vatsloc.workflow.pose import ChangeOfPose
@@ -33,7 +34,9 @@ class Collapse:
     """The lung after its collapse, in the deflated CBCT's frame.
 
     model: what mechanics made of the observations; residual: what images added to it; refinement: what small blocks of
-    the CT added to that, None where it is off; points_after: (n, 3) mm, nodes of `observed.mesh_before` after all.
+    the CT added to that, None where it is off; points_after: (n, 3) mm, nodes of `observed.mesh_before` after all;
+    fissure: the sheet along which it may have parted, None where that was not looked for; parted: how it was cut, None
+    for one piece.
     """
 
     observed: Observed
@@ -41,6 +44,8 @@ class Collapse:
     residual: Residual | None
     points_after: Array
     refinement: BlockRefinement | None = None
+    fissure: Fissure | None = None
+    parted: Parted | None = None
 
     @property
     def def_from_inf_rigid(self) -> RigidTransform:
@@ -101,18 +106,24 @@ def collapse(
     before = observed.mesh_before
     after = before.points + interpolate(locate(observed.model_mesh, before.points), model.displacement)
     residual = _residual(prepared, pose, observed, model, after, settings, stages)
-    after = after if residual is None else after + residual.displacement
+    return Collapse(observed, model, residual, after if residual is None else after + residual.displacement)
+
+
+def refined(
+    case: Case, prepared: Prepared, pose: ChangeOfPose, collapse: Collapse, settings: Settings, stages: Stages
+) -> Collapse:
+    """The collapse, in one piece or in several, after it followed small blocks of the CT."""
     if not settings.refinement.on:
         stages.skip(REFINEMENT, "switched off in the settings")
-        return Collapse(observed, model, residual, after)
+        return collapse
     with stages.stage(REFINEMENT):
-        to_deflated = MeshMap(pose.mesh_ct, after, observed.def_from_inf_rigid @ pose.inf_from_ct_rigid)
+        around = collapse.def_from_inf_rigid @ pose.inf_from_ct_rigid
         refinement = refine_by_blocks(
-            Compared(case.ct, prepared.lung_ct, prepared.deflated, observed.found.lung),
-            Shape(before, to_deflated, np.zeros(0, dtype=int)),
+            Compared(case.ct, prepared.lung_ct, prepared.deflated, collapse.observed.found.lung),
+            Shape(collapse.mesh_before, MeshMap(pose.mesh_ct, collapse.points_after, around), np.zeros(0, dtype=int)),
             settings.refinement,
         )
-    return Collapse(observed, model, residual, refinement.points, refinement)
+    return replace(collapse, points_after=refinement.points, refinement=refinement)
 
 
 def _residual(
@@ -132,19 +143,24 @@ def _residual(
     seen = f"the model misses held-out keypoints by {misfit_mm:.2f} mm (median)"
     if not stages.choose(weigh(RESIDUAL, misfit_mm, settings.leave_out.residual_mm, seen)):
         return None
-    rigid, chosen = observed.def_from_inf_rigid, settings.residual
+    with stages.stage(RESIDUAL):
+        return residual_of_part(prepared, Collapse(observed, model, None, after), pose.mesh_inf, settings)
+
+
+def residual_of_part(prepared: Prepared, modelled: Collapse, mesh_inf: TetMesh, settings: Settings) -> Residual | None:
+    """What the images add to the model of a lung, or of a part of it whose mesh in the inflated CBCT is `mesh_inf`."""
+    model, rigid, chosen = modelled.model, modelled.def_from_inf_rigid, settings.residual
     if any(refinement.kept for refinement in model.refinements):
         chosen = chosen.model_copy(update={"levels": max(chosen.levels - 1, 1)})
-    with stages.stage(RESIDUAL):
-        return residual_registration(
-            prepared,
-            observed.found.lung,
-            MeshMap(pose.mesh_inf, after, rigid),
-            observed.mesh_before,
-            observed.surface,
-            chosen,
-            model.correspondences.mapped(moving=rigid.inverse()),
-        )
+    return residual_registration(
+        prepared,
+        modelled.observed.found.lung,
+        MeshMap(mesh_inf, modelled.points_after, rigid),
+        modelled.mesh_before,
+        modelled.observed.surface,
+        chosen,
+        model.correspondences.mapped(moving=rigid.inverse()),
+    )
 
 
 def contact_surface(collapse: Collapse) -> TriSurface:

@@ -26,14 +26,14 @@ def quality_gates(pose: ChangeOfPose, collapse: Collapse, limits: GateSettings) 
     gates |= spine_gates(pose.rigid, collapse.observed.rigid, limits)
     after = collapse.mesh_after
     inverted = float((signed_volumes(after.points, after.tets) <= 0).mean())
-    air, fissure = (len(collapse.observed.surface.only(border)) for border in (Border.AIR, Border.FISSURE))
+    air = len(collapse.observed.surface.only(Border.AIR))
     gates |= {
         "inverted_elements": at_most(inverted, limits.max_inverted_elements, "The collapse turns elements inside out."),
         "deflated_surface": at_least(air, limits.min_surface_points, "Too little of the collapsed lung is seen."),
         "fissures": at_most(
-            fissure / max(air + fissure, 1),
+            unexplained_gas(collapse),
             limits.max_fissure_share,
-            "Lobes have come apart, but the lung is modelled in one piece.",
+            "Gas lies where the lung was, and no cut between lobes explains it.",
         ),
         "surface": at_most(
             float(np.median(surface_distances(collapse))),
@@ -61,6 +61,16 @@ def quality_gates(pose: ChangeOfPose, collapse: Collapse, limits: GateSettings) 
             collapse.residual.model_error_mm, limits.max_model_error_mm, "The images contradict the model."
         )
     return gates
+
+
+def unexplained_gas(collapse: Collapse) -> float:
+    """Share of the gas's border that came from inside the lung, cuts left out; where too few keypoints tell where it
+    came from, the share that faces lung again.
+    """
+    if collapse.fissure is not None:
+        return collapse.fissure.unexplained(collapse.parted is not None)
+    air, facing = (len(collapse.observed.surface.only(border)) for border in (Border.AIR, Border.FISSURE))
+    return facing / max(air + facing, 1)
 
 
 def ellipsoid_gate(semi_axes_mm: Array, limits: GateSettings) -> Gate:

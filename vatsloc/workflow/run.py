@@ -207,6 +207,7 @@ def _record(case: Case, found: Localization, settings: Settings, stages: Stages)
             "calibration": {name: by.entry() for name, by in case.calibration.items()},
             "gravity_ras": case.gravity_ras,
             "choices": [choice.entry() for choice in stages.choices],
+            "pieces": {"n": 1, "fissures": []} if found.collapse.parted is None else found.collapse.parted.entry(),
             "solid": found.collapse.model.solid.entry(),
             "scans": case.scans,
             "cbct_preparation": {

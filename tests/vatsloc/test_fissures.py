@@ -1,0 +1,92 @@
+"""The sheet along which a lung parted, from keypoints that moved otherwise on its sides and from gas along it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from vatsloc.workflow.fissures import Fissure, Sheet, find_fissure, mapped, smooth_map
+
+HILUM = np.array([50.0, 10.0, -100.0])
+TRUE = Sheet(HILUM, np.array([0.9, 0.1, 6.0, 4.0, -3.0, 2.0]))
+LUNG_MM = np.array([50.0, 80.0, 100.0])
+
+
+def _scene(jump_mm: float, seed: int = 1, count: int = 400) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Keypoints, their motion (collapse towards the hilum, lobes sliding by a jump, 5 % wrong) and gas on the sheet."""
+    rng = np.random.default_rng(seed)
+    points = HILUM + rng.uniform(-1, 1, (count, 3)) * LUNG_MM
+    d = points - HILUM
+    motion = -0.25 * d + 0.0008 * d[:, [1, 2, 0]] * d[:, [0, 0, 1]] + rng.normal(0, 0.8, d.shape)
+    motion[TRUE.distance(points) < 0] += jump_mm * np.array([0.2, -0.5, 0.85])
+    wrong = rng.random(count) < 0.05
+    motion[wrong] += rng.normal(0, 12, (int(wrong.sum()), 3))
+    gas = HILUM + rng.uniform(-1, 1, (4000, 3)) * LUNG_MM
+    gas = gas[np.abs(TRUE.distance(gas)) < 2.0]
+    return points, motion, gas
+
+
+def test_keypoints_and_gas_tell_the_sheet() -> None:
+    points, motion, gas = _scene(15.0)
+    found = find_fissure(points, motion, gas, HILUM, 5000)
+    assert found is not None
+    assert found.evidence == ("keypoints", "gas")
+    clear = np.abs(TRUE.distance(points)) > 4.0
+    same = (found.sheet.distance(points) > 0) == (TRUE.distance(points) > 0)
+    assert same[clear].mean() > 0.98
+    assert found.gas_share > 0.95
+
+
+def test_a_lung_in_one_piece_gives_no_evidence() -> None:
+    points, motion, _ = _scene(0.0)
+    found = find_fissure(points, motion, np.zeros((0, 3)), HILUM, 5000)
+    assert found is None or found.evidence == ()
+
+
+def test_gas_all_over_the_lung_is_no_evidence() -> None:
+    points, motion, _ = _scene(15.0)
+    gas = HILUM + np.random.default_rng(2).uniform(-1, 1, (300, 3)) * LUNG_MM
+    found = find_fissure(points, motion, gas, HILUM, 5000)
+    assert found is not None
+    assert found.evidence == ("keypoints",)
+
+
+def test_few_keypoints_tell_nothing() -> None:
+    points, motion, gas = _scene(15.0, count=30)
+    assert find_fissure(points, motion, gas, HILUM, 0) is None
+
+
+@pytest.mark.parametrize(
+    ("fissure", "evidence"),
+    [
+        (Fissure(TRUE, 0.75, 40, 0.6, 400), ("keypoints", "gas")),
+        (Fissure(TRUE, 0.76, 40, 0.6, 400), ("gas",)),
+        (Fissure(TRUE, 0.75, 39, 0.6, 400), ("keypoints",)),
+        (Fissure(TRUE, 0.75, 40, 0.59, 400), ("keypoints",)),
+    ],
+)
+def test_evidence_has_limits(fissure: Fissure, evidence: tuple[str, ...]) -> None:
+    assert fissure.evidence == evidence
+
+
+def test_a_sheet_is_a_distance_for_planes_and_positive_above() -> None:
+    plane = Sheet(HILUM, np.array([1.0, 0.0, 5.0, 0.0, 0.0, 0.0]))
+    above = HILUM + np.array([[0.0, 0.0, 0.0], [7.0, 0.0, 5.0], [0.0, -5.0, 0.0]])
+    np.testing.assert_allclose(plane.distance(above), np.array([5.0, 10.0, 0.0]) / np.sqrt(2), atol=1e-12)
+
+
+def test_a_smooth_map_is_followed_and_strays_are_not() -> None:
+    rng = np.random.default_rng(4)
+    points = rng.uniform(-60, 60, (300, 3))
+    true = 0.2 * points + 0.001 * points[:, [0]] * points + 3.0
+    wrong = true.copy()
+    wrong[::10] += 25.0
+    told = mapped(smooth_map(points, wrong), points)
+    assert np.linalg.norm(told - true, axis=1).max() < 1.0
+
+
+def test_gas_that_a_cut_explains_is_taken_off() -> None:
+    found = Fissure(TRUE, 0.5, 60, 0.75, 300)
+    assert found.unexplained(False) == pytest.approx(0.2)
+    assert found.unexplained(True) == pytest.approx(0.05)
+    assert Fissure(TRUE, 0.5, 0, 0.0, 0).unexplained(False) == 0
