@@ -17,8 +17,8 @@ from registration.volume import Mask
 from vatsloc.errors import CaseError, InputRefused
 from vatsloc.study.bench import real as bench
 from vatsloc.study.bench import real_draw
-from vatsloc.study.bench.affine import affine_to_points, affine_to_shape
-from vatsloc.study.bench.breathing import Lung
+from poro.breathing.affine import affine_to_points, affine_to_shape
+from poro.breathing.elastic import Lung
 from vatsloc.study.bench.breaths import EXPIRATION, INSPIRATION, LANDMARKS, Marks, read_person, to_the_back
 from vatsloc.study.bench.poro_lung import lung, wall_level
 

@@ -17,7 +17,7 @@ from vatsloc.errors import CaseError, InputRefused
 from vatsloc.formats.guard import reading
 from vatsloc.formats.images import read_mask
 from vatsloc.imaging.lungs import Side, split_lungs
-from vatsloc.study.bench.breathing import Lung
+from poro.breathing.elastic import Lung
 
 INSPIRATION, EXPIRATION, LANDMARKS = "lungs_inspiration.nii.gz", "lungs_expiration.nii.gz", "landmarks_ras_mm.csv"
 _COLUMNS = ["insp_x", "insp_y", "insp_z", "exp_x", "exp_y", "exp_z"]

@@ -12,7 +12,7 @@ from poro.arrays import Array
 from poro.fem import Tissue
 from poro.fem.tissue import GRAVITY_KPA_PER_MM
 from poro.mesh import TetMesh, stuff
-from vatsloc.study.bench.breathing import WALL_ALONE, Breathing, Lung, breathe_out, bronchi, caudal, hilum, spread_map
+from poro.breathing.elastic import WALL_ALONE, Breathing, Lung, breathe_out, bronchi, caudal, hilum, spread_map
 
 HALF = np.array([35.0, 55.0, 75.0])
 

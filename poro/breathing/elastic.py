@@ -8,11 +8,13 @@ shape decides; moduli are those of `poro.fem.tissue.Tissue`.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from scipy.sparse import coo_matrix, csr_matrix, diags, vstack
 
 from poro.arrays import Array
+from poro.breathing.affine import Affine
 from poro.fem import Tissue
 from poro.fem.constraints import point_constraints
 from poro.fem.forms import stiffness
@@ -20,8 +22,8 @@ from poro.fem.tissue import GRAVITY_KPA_PER_MM
 from poro.linalg import linear_solver
 from poro.mesh import TetMesh, closest_points
 from poro.mesh.patches import INWARD
-from vatsloc.imaging.lungs import Side
-from vatsloc.study.bench.affine import Affine
+
+Side = Literal["left", "right"]
 
 ROUNDS = 6
 WALL_KPA_PER_MM = 0.3
