@@ -148,7 +148,7 @@ def _step(
 ) -> tuple[LinearSolver, Array]:
     moduli, matrix = tangents
     for convex in (True,) if residual > _NEAR else (False, True):
-        used = _convex(moduli.reshape(-1, 9, 9)).reshape(moduli.shape) if convex else moduli
+        used = convex(moduli.reshape(-1, 9, 9)).reshape(moduli.shape) if convex else moduli
         whole = (tangent_stiffness(scene.mesh, used) + matrix).tocsr()
         whole = (whole + diags(np.full(whole.shape[0], 1e-9 * whole.diagonal().mean()))).tocsr()
         try:
@@ -172,7 +172,8 @@ def _tissue(scene: Scene, f: Array) -> tuple[Array, Array, Array]:
     return energy - p, stress - p[:, None, None] * inverse, moduli - p[:, None, None, None, None] * turned
 
 
-def _energy(scene: Scene, u: Array) -> float:
+def energy_of(scene: Scene, u: Array) -> float:
+    """Stored energy less the work of the loads, kPa mm3; infinite where an element is inverted."""
     f = deformation_gradient(scene.mesh, u)
     if not (np.linalg.det(f) > 0).all():
         return np.inf
@@ -184,17 +185,17 @@ def _energy(scene: Scene, u: Array) -> float:
 
 def _length(scene: Scene, u: Array, change: Array, slope: float) -> float | None:
     """Largest tried length that lowers the energy; None when none does."""
-    before = _energy(scene, u)
+    before = energy_of(scene, u)
     slack = 1e-10 * (abs(before) + 1)
     length = 1.0
     for _ in range(_HALVINGS):
-        if _energy(scene, u + length * change) <= before - 1e-4 * length * slope + slack:
+        if energy_of(scene, u + length * change) <= before - 1e-4 * length * slope + slack:
             return length
         length /= 2
     return None
 
 
-def _convex(matrices: Array) -> Array:
+def convex(matrices: Array) -> Array:
     """Symmetric matrices (m, k, k) with their negative eigenvalues set to zero."""
     values, vectors = np.linalg.eigh(matrices)
     return np.asarray((vectors * np.maximum(values, 0)[:, None]) @ vectors.transpose(0, 2, 1))
