@@ -16,11 +16,11 @@ from poro.breathing.equilibrium import Scene, convex, energy_of, volume
 from poro.fem.forms import deformation_gradient, eigenstress_load, tangent_stiffness
 from poro.linalg.solver import linear_solver
 
-STEPS = 15
+STEPS = 10
 _HALVINGS = 8
 VOLUME_KPA = 20.0
 """Stiffness of the spring that holds the volume: a suction of 0.2 kPa leaves one hundredth of it missing."""
-CLOSE_MM = 0.05
+CLOSE_MM = 0.3
 """Largest change of a node in a step at which the lung has settled."""
 
 
