@@ -26,7 +26,7 @@ STEP_MM, SMOOTH_MM = 5.0, 2.5
 
 @dataclass(frozen=True)
 class Inflating:
-    """Everything about one lung's inspiration that no phase changes. guess: (n, 3) mm, the lung laid out by its spread;
+    """Everything about one lung's inspiration that no phase changes. guess: (n, 3) mm, the lung laid out by its spread; load: (n, 3) at the end of the way;
     full_mm3: volume of the inspired lung; behind: (k,) mm, how far border nodes lie behind the wall at the start.
     """
 
@@ -34,8 +34,7 @@ class Inflating:
     material: ConstitutiveModel
     cavity: Cavity
     matrix: csr_matrix
-    weight: Array
-    rise: Array
+    load: Array
     guess: Array
     full_mm3: float
     tree: Tree
@@ -49,7 +48,7 @@ class Inflating:
         """What acts at a share of the way; nodes that start behind the wall are let back in little by little."""
         wall = self.cavity
         cavity = Cavity(wall.level, wall.nodes, wall.stiffness, (1 - share) * wall.offset)
-        return Scene(self.mesh, self.material, Springs(self.matrix, share * (self.weight + self.rise)), cavity=cavity, tree=self.tree)
+        return Scene(self.mesh, self.material, Springs(self.matrix, share * self.load), cavity=cavity, tree=self.tree)
 
 
 def inflating(lung: Lung, acting: Breathing, material: ConstitutiveModel | None = None) -> Inflating:
@@ -57,23 +56,30 @@ def inflating(lung: Lung, acting: Breathing, material: ConstitutiveModel | None 
     tissue, mesh, border = Tissue(), lung.expired, lung.expired.boundary
     level = level_set(lung.inspired.boundary, STEP_MM, SMOOTH_MM)
     behind = np.minimum(level.evaluate(border.points)[0], 0)
-    root = hilum(mesh, lung.side)
-    near = np.exp(-(((mesh.points - root) / acting.held_mm) ** 2).sum(axis=1)) * mesh.node_volumes
-    held = acting.held_kpa_mm * near / near.sum()
-    lost = 1 - np.ptp(mesh.points[:, 1]) / np.ptp(lung.inspired.points[:, 1])
-    rise, weight = np.zeros_like(mesh.points), np.zeros_like(mesh.points)
-    rise[:, 2] = -held * caudal(lung.inspired) * acting.turn * lost / (1 - lost) * (mesh.points[:, 1] - root[1])
-    weight[:, 1] = acting.mass_kg * 1e9 * GRAVITY_KPA_PER_MM * mesh.node_volumes / mesh.volumes.sum()
-    anchor = 1e-6 * tissue.young_kpa * np.cbrt(mesh.node_volumes)
-    springs = np.column_stack([anchor, anchor, anchor + held]).ravel()
+    springs, load = rising(lung, acting, tissue)
     return Inflating(
         mesh,
         material or neo_hookean(tissue),
         Cavity(level, border.nodes, WALL_KPA_PER_MM * border.node_areas, behind),
-        diags(springs).tocsr(),
-        weight,
-        rise,
+        springs,
+        load,
         spread_map(mesh, lung.inspired)(mesh.points) - mesh.points,
         float(lung.inspired.volumes.sum()),
         tree_of(mesh),
     )
+
+
+def rising(lung: Lung, acting: Breathing, tissue: Tissue) -> tuple[csr_matrix, Array]:
+    """Springs (3n, 3n) that hold the expired lung's bronchi, and forces (n, 3) kPa mm2 at the end of its inspiration:
+    the weight that no longer sags it, and the front's rise with the ribs.
+    """
+    mesh = lung.expired
+    root = hilum(mesh, lung.side)
+    near = np.exp(-(((mesh.points - root) / acting.held_mm) ** 2).sum(axis=1)) * mesh.node_volumes
+    held = acting.held_kpa_mm * near / near.sum()
+    lost = np.clip(1 - np.ptp(mesh.points[:, 1]) / np.ptp(lung.inspired.points[:, 1]), -0.5, 0.5)
+    load = np.zeros_like(mesh.points)
+    load[:, 2] = -held * caudal(lung.inspired) * acting.turn * lost / (1 - lost) * (mesh.points[:, 1] - root[1])
+    load[:, 1] = acting.mass_kg * 1e9 * GRAVITY_KPA_PER_MM * mesh.node_volumes / mesh.volumes.sum()
+    anchor = 1e-6 * tissue.young_kpa * np.cbrt(mesh.node_volumes)
+    return diags(np.column_stack([anchor, anchor, anchor + held]).ravel()).tocsr(), load

@@ -147,15 +147,15 @@ def _step(
     scene: Scene, tangents: tuple[Array, csr_matrix], unbalanced: Array, residual: float
 ) -> tuple[LinearSolver, Array]:
     moduli, matrix = tangents
-    for convex in (True,) if residual > _NEAR else (False, True):
-        used = convex(moduli.reshape(-1, 9, 9)).reshape(moduli.shape) if convex else moduli
+    for safe in (True,) if residual > _NEAR else (False, True):
+        used = convex(moduli.reshape(-1, 9, 9)).reshape(moduli.shape) if safe else moduli
         whole = (tangent_stiffness(scene.mesh, used) + matrix).tocsr()
         whole = (whole + diags(np.full(whole.shape[0], 1e-9 * whole.diagonal().mean()))).tocsr()
         try:
             solver = linear_solver(whole, scene.mesh.points, scene.tree)
             return solver, solver.solve(unbalanced.ravel()).reshape(-1, 3)
         except SolverError:
-            if convex:
+            if safe:
                 raise
     raise AssertionError
 

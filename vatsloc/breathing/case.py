@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from registration.volume import Array, Mask, Volume
 from vatsloc.errors import CaseError, InputRefused
@@ -41,13 +41,28 @@ class One(_Table):
     file: str | None = None
 
 
+class Signal(_Table):
+    """file: t_s, volume; hysteresis: how much the diaphragm leads on the way in, 0 for none to 1."""
+
+    file: str | None = None
+    hysteresis: float = Field(default=0.0, ge=0, le=1)
+
+
+class Tumour(_Table):
+    """A ball put into the image of the scan, for driver one-scan. centre: RAS mm."""
+
+    centre: tuple[float, float, float]
+    radius_mm: float = Field(default=10.0, gt=0, le=60)
+
+
 class BreathFile(_Table):
     """The whole of breath.toml; every key may be left out, but not all images and masks."""
 
     images: Pair = Pair()
     masks: Pair = Pair()
-    signal: One = One()
+    signal: Signal = Signal()
     landmarks: One = One()
+    tumour: Tumour | None = None
 
 
 @dataclass(frozen=True)
@@ -69,6 +84,8 @@ class BreathCase:
     expiration: Scan | None
     signal: Array | None
     landmarks: Path | None
+    hysteresis: float = 0.0
+    tumour: Tumour | None = None
 
 
 def read_breath(folder: Path) -> BreathCase:
@@ -87,6 +104,8 @@ def read_breath(folder: Path) -> BreathCase:
         scans["expiration"],
         None if file.signal.file is None else read_signal(folder / file.signal.file),
         None if file.landmarks.file is None else folder / file.landmarks.file,
+        file.signal.hysteresis,
+        file.tumour,
     )
 
 

@@ -61,7 +61,7 @@ def both_scans(case: BreathCase, edge_mm: float = EDGE_MM) -> tuple[list[Pair], 
             )
         if ratio < 1:
             notes.append(f"The {side} lung is smaller in the inspiration ({ratio:.2f} of the expiration's volume).")
-        pairs.append(Pair(side, full, rest, Lung(side, _mesh(full, edge_mm), _mesh(rest, edge_mm))))
+        pairs.append(Pair(side, full, rest, Lung(side, meshed(full, edge_mm), meshed(rest, edge_mm))))
     return pairs, notes
 
 
@@ -75,7 +75,8 @@ def masks_of(scan: Scan) -> CleanLungs:
     return lungs_of(on_grid(both, work.grid, work.grid), scan.name)
 
 
-def _mesh(lung: Mask, edge_mm: float) -> TetMesh:
+def meshed(lung: Mask, edge_mm: float) -> TetMesh:
+    """Tetrahedra that fill a lung. Raises InputRefused where the mask cannot hold them."""
     try:
         return stuff(lung.inside, lung.ras_from_ijk, edge_mm)
     except ValueError as refusal:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from poro.mesh.tetmesh import signed_volumes
-from vatsloc.breathing import pressure_volume, surface
+from vatsloc.breathing import one_scan, pressure_volume, regional_pressure, surface
 from vatsloc.breathing.case import BreathCase, read_breath
 from vatsloc.breathing.film import animated, as_png, frames
 from vatsloc.breathing.motion import Motion
@@ -24,6 +24,8 @@ from vatsloc.formats.meshes import TetraMesh, write_vtu
 Drive = Callable[[BreathCase, int, Callable[[str], None]], Motion]
 DRIVERS: Mapping[str, Drive] = {
     "pressure-volume": pressure_volume.drive,
+    "regional-pressure": regional_pressure.drive,
+    "one-scan": one_scan.drive,
     "surface": surface.drive,
 }
 """How a breath is driven, by the name on the command line: one room's module per paper."""
