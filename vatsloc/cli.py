@@ -109,12 +109,15 @@ def breathe(
         str, typer.Option(metavar="NAME", help="pressure-volume, regional-pressure, one-scan or surface.")
     ],
     states: Annotated[int, typer.Option(metavar="N", help="Number of states.")] = 10,
+    fit_landmarks: Annotated[
+        bool, typer.Option("--fit-landmarks", help="Experiment: regional-pressure is fitted to the landmarks as well.")
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Make the lungs of CASE breathe: meshes, fields, images and a film of every state."""
     from vatsloc.breathing.run import breathe_case
 
-    result = breathe_case(case, out, driver, states, say)
+    result = breathe_case(case, out, driver, states, say, fit_landmarks)
     if as_json:
         show(result)
     else:

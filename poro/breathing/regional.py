@@ -36,7 +36,9 @@ TOUCH_MM = 10.0
 """Farther from a wall at rest the lung does not touch it."""
 ANCHOR = 0.02
 """Stiffness, over the tissue's own, by which the chest is held everywhere; its back is held 100 times as firmly."""
-SURFACE_ROUNDS, INNER = 10, 2
+SURFACE_ROUNDS, INNER = 12, 3
+PRIOR_MM_PER_KPA = 0.5
+"""Root mean square distance that a pressure of 1 kPa is held to be worth."""
 REACH_MM = 15.0
 """How far a step of the fit may move any node."""
 STILL_MM = 0.3
@@ -202,6 +204,10 @@ def _distances(
     robust = 1 / np.sqrt(1 + (along / 20.0) ** 2)
     slope = np.einsum("qd,qdp->qp", normal, np.concatenate([change, at_back]))
     residual, slope = root * robust * along, (root * robust)[:, None] * slope
+    # Patches that the border hardly tells apart would run away against each other.
+    k = len(state.p)
+    residual = np.concatenate([residual, PRIOR_MM_PER_KPA * state.p])
+    slope = np.concatenate([slope, PRIOR_MM_PER_KPA * np.eye(k)])
     mean = float(np.average(np.abs(there.distance), weights=moved.node_areas))
     if matched is not None:
         where, rest, goal = matched

@@ -37,7 +37,7 @@ def drive(case: BreathCase, count: int, say: Callable[[str], None]) -> Motion:
     clean = masks_of(scan)
     notes = list(clean.notes)
     start = sum(_ml(mask) for mask in clean.lungs.values())
-    full = _full_ml(case, scan, start, direction, notes)
+    full = _full_ml(case, scan, (start, len(clean.lungs)), direction, notes)
     if case.signal is None:
         t, volume = np.linspace(0, PERIOD_S, count), quiet_breath(count, direction == OUT)
     else:
@@ -70,12 +70,14 @@ def drive(case: BreathCase, count: int, say: Callable[[str], None]) -> Motion:
     return Motion("one-scan", direction, tuple(lungs), pressure, end, tuple(notes), details)
 
 
-def _full_ml(case: BreathCase, scan: Scan, start: float, direction: str, notes: list[str]) -> float:
-    """Volume at the other end of the breath."""
+def _full_ml(case: BreathCase, scan: Scan, at_scan: tuple[float, int], direction: str, notes: list[str]) -> float:
+    """Volume at the other end of the breath. at_scan: ml, and of how many lungs."""
+    start, lungs = at_scan
     other = case.expiration if scan is case.inspiration else case.inspiration
     if other is None:
-        full = start + TIDAL_ML * (1 if direction == IN else -1)
-        notes.append(f"The depth of the breath is not known; {TIDAL_ML:.0f} ml, a quiet breath's, are taken.")
+        tidal = TIDAL_ML * lungs / 2
+        full = start + tidal * (1 if direction == IN else -1)
+        notes.append(f"The depth of the breath is not known; {tidal:.0f} ml, a quiet breath's, are taken.")
     else:
         full = sum(_ml(mask) for mask in masks_of(other).lungs.values())
         notes.append(f"Of the {other.name} the volume alone was taken, {full:.0f} ml, as the depth of the breath.")

@@ -14,6 +14,7 @@ from poro.mesh.tetmesh import signed_volumes
 from vatsloc.breathing import one_scan, pressure_volume, regional_pressure, surface
 from vatsloc.breathing.case import BreathCase, read_breath
 from vatsloc.breathing.film import animated, as_png, frames
+from vatsloc.breathing.images import write_images
 from vatsloc.breathing.motion import Motion
 from vatsloc.breathing.page import Strip, Table, page
 from vatsloc.breathing.score import score
@@ -33,8 +34,13 @@ RESULT, PAGE = "breath.json", "breath.html"
 STATES = (2, 200)
 
 
-def breathe_case(folder: Path, out: Path, driver: str, count: int, say: Callable[[str], None]) -> dict[str, Any]:
-    """Drive the lungs of a folder through `count` states and write them to `out`. Returns what `--json` prints."""
+def breathe_case(
+    folder: Path, out: Path, driver: str, count: int, say: Callable[[str], None], see_landmarks: bool = False
+) -> dict[str, Any]:
+    """Drive the lungs of a folder through `count` states and write them to `out`. Returns what `--json` prints.
+
+    see_landmarks: the fit of regional pressures may see the landmarks too, and says so.
+    """
     if driver not in DRIVERS:
         raise CaseError(f"{driver!r} is no driver; take {', '.join(DRIVERS)}.")
     if not STATES[0] <= count <= STATES[1]:
@@ -42,7 +48,7 @@ def breathe_case(folder: Path, out: Path, driver: str, count: int, say: Callable
     began = perf_counter()
     case = read_breath(folder)
     with whole_folder(out, (RESULT, PAGE), is_breath) as partial:
-        motion = DRIVERS[driver](case, count, say)
+        motion = run_driver(case, driver, count, say, see_landmarks)
         seconds = perf_counter() - began
         result = {
             "program": PROGRAM,
@@ -57,13 +63,28 @@ def breathe_case(folder: Path, out: Path, driver: str, count: int, say: Callable
             **motion.details,
         }
         write_states(partial, motion)
+        views, more = write_images(partial, case, motion, say)
+        result |= more
         pictures = frames(motion)
         (partial / "film.webp").write_bytes(animated(pictures))
         (partial / "arrows.png").write_bytes(as_png(pictures[-1 if motion.end is None else motion.end]))
-        strips, tables = [Strip("From the front, arrows from the places in the first scan", pictures)], _tables(result)
+        if views:
+            (partial / "coronal.webp").write_bytes(animated([np.stack([p] * 3, axis=2) for p in views[0].pictures]))
+        strips, tables = [Strip("From the front, arrows from the places in the first scan", pictures), *views], _tables(result)
         (partial / PAGE).write_text(page(case.name, result, strips, tables), encoding="utf-8")
         (partial / RESULT).write_text(json.dumps(result, indent=1, allow_nan=False) + "\n", encoding="utf-8")
     return result
+
+
+def run_driver(
+    case: BreathCase, driver: str, count: int, say: Callable[[str], None], see_landmarks: bool = False
+) -> Motion:
+    """The motion of a case by a driver's name."""
+    if not see_landmarks:
+        return DRIVERS[driver](case, count, say)
+    if driver != "regional-pressure":
+        raise CaseError(f"--fit-landmarks is an experiment of regional-pressure; leave it out with {driver}.")
+    return regional_pressure.drive(case, count, say, see_landmarks=True)
 
 
 def is_breath(folder: Path) -> bool:
