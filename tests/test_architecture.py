@@ -65,7 +65,17 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         },
         "phantom_command": {"errors", "terminal", "synthetic", "study"},
         "cli": {
-            *("errors", "terminal", "phantom_command", "new_case", "workflow", "evaluation", "synthetic", "study"),
+            *(
+                "errors",
+                "terminal",
+                "phantom_command",
+                "new_case",
+                "workflow",
+                "evaluation",
+                "synthetic",
+                "study",
+                "breathing",
+            ),
         },
         "__main__": {"cli"},
     },
@@ -79,7 +89,7 @@ FOREIGN: dict[str, set[str]] = {
 }
 """Package -> packages of ours that it must not know. What phantoms load is tested beside their other tests."""
 
-MAKERS = {"synthetic", "study"}
+MAKERS = {"synthetic", "study", "breathing"}
 """Rooms of vatsloc that may know phantoms. A run and its evaluation do not: they treat a phantom as any other case."""
 
 

@@ -69,7 +69,9 @@ def body(mesh: TetMesh, hu: Array, still: Array, lungs: list[TriSurface]) -> Bod
     held, _ = point_constraints(operator, stiffness, np.zeros((len(near), 3)))
     anchors = np.where(still, HELD * size, 1e-4 * size)
     matrix = (tangent_stiffness(mesh, _moduli(young)) + held + diags(np.repeat(anchors, 3))).tocsr()
-    return Body(mesh, hu, np.flatnonzero(still), near, normals[near], operator, stiffness, linear_solver(matrix, points))
+    return Body(
+        mesh, hu, np.flatnonzero(still), near, normals[near], operator, stiffness, linear_solver(matrix, points)
+    )
 
 
 def border_motion(lungs: list[TriSurface], moved: list[Array], points: Array) -> Array:
@@ -92,7 +94,9 @@ def network(scene: Body, wanted: Array) -> tuple[Array, int]:
     """
     mesh = scene.mesh
     i, j = np.triu_indices(4, 1)
-    edges = np.unique(np.sort(np.concatenate([mesh.tets[:, [a, b]] for a, b in zip(i, j, strict=True)]), axis=1), axis=0)
+    edges = np.unique(
+        np.sort(np.concatenate([mesh.tets[:, [a, b]] for a, b in zip(i, j, strict=True)]), axis=1), axis=0
+    )
     a, b = edges.T
     hu = (scene.hu[a] + scene.hu[b]) / 2
     spring = np.where(hu > 700, 1 - 0.2 * np.exp(-(hu - 700) / 500), 0.001 + 0.799 * np.clip((hu + 1000) / 1700, 0, 1))

@@ -26,8 +26,10 @@ STEP_MM, SMOOTH_MM = 5.0, 2.5
 
 @dataclass(frozen=True)
 class Inflating:
-    """Everything about one lung's inspiration that no phase changes. guess: (n, 3) mm, the lung laid out by its spread; load: (n, 3) at the end of the way;
-    full_mm3: volume of the inspired lung; behind: (k,) mm, how far border nodes lie behind the wall at the start.
+    """Everything about one lung's inspiration that no phase changes.
+
+    guess: (n, 3) mm, the lung laid out by its spread; load: (n, 3) kPa mm2 at the end of the way; full_mm3: volume of
+    the inspired lung. The cavity's offsets say how far border nodes lie behind the wall at the start.
     """
 
     mesh: TetMesh

@@ -86,7 +86,9 @@ class Scene:
 
 @dataclass(frozen=True)
 class Equilibrium:
-    """u: (n, 3) mm; residuals: relative ones of every Newton step; solver: of the last tangent; balance: how it ended."""
+    """u: (n, 3) mm; residuals: relative ones of every Newton step; solver: of the last tangent; balance: how it
+    ended.
+    """
 
     u: Array
     residuals: tuple[float, ...]

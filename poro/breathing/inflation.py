@@ -18,8 +18,8 @@ from poro.linalg.solver import linear_solver
 
 STEPS = 10
 _HALVINGS = 8
-VOLUME_KPA = 20.0
-"""Stiffness of the spring that holds the volume: a suction of 0.2 kPa leaves one hundredth of it missing."""
+VOLUME_KPA = 60.0
+"""Stiffness of the spring that holds the volume: a suction of 0.6 kPa leaves one hundredth of it missing."""
 CLOSE_MM = 0.3
 """Largest change of a node in a step at which the lung has settled."""
 
@@ -61,6 +61,8 @@ def fill_to(scene: Scene, wanted_mm3: float, u: Array) -> Filled:
     """
     rest_mm3 = float(scene.mesh.volumes.sum())
     settled, taken = False, 0
+    while not np.isfinite(energy_of(scene, u)) and np.abs(u).max() > CLOSE_MM:
+        u = u / 2
     while taken < STEPS and not settled:
         taken += 1
         suction = VOLUME_KPA * (wanted_mm3 - volume(scene.mesh, u)) / rest_mm3
@@ -92,6 +94,8 @@ def _length(scene: Scene, u: Array, change: Array, wanted_mm3: float, slope: flo
         return stored + VOLUME_KPA / 2 * (wanted_mm3 - volume(scene.mesh, at)) ** 2 / rest_mm3
 
     before, length = energy(u), 1.0
+    if not np.isfinite(before):
+        return None
     for _ in range(_HALVINGS):
         if energy(u + length * change) <= before - 1e-4 * length * slope + 1e-12 * abs(before):
             return length

@@ -14,7 +14,7 @@ from scipy.sparse import bsr_matrix, coo_matrix, diags
 from scipy.sparse.csgraph import connected_components
 
 from poro.arrays import Array
-from poro.breathing.elastic import Side, caudal
+from poro.breathing.elastic import Side, caudal, depth_of
 from poro.breathing.equilibrium import Scene, Springs, tree_of
 from poro.breathing.inflation import Filled, fill_to
 from poro.fem.constitutive import ConstitutiveModel
@@ -33,8 +33,8 @@ CHEST_SHARE = 0.45
 WALL_KPA_PER_MM, DIAPHRAGM_KPA_PER_MM = 0.3, 0.03
 """Springs that ask the border for that motion: along the normal of chest, back and mediastinum, along the body for the
 diaphragm. The paper lets the border go free; nothing but the apex then keeps a lung from turning."""
-MASS_KG, SAG_RATIO = 0.23, 0.6
-"""Weight by which tissue sags once the volume has fallen to that ratio, as in `elastic.Breathing`."""
+MASS_KG = 0.23
+"""Weight by which tissue sags at the end of a deep expiration, as in `elastic.Breathing`; none in a quiet one."""
 FIRM = 1e3
 """Stiffness of what is held, over the tissue's own."""
 
@@ -93,7 +93,7 @@ class OneScan:
             share = wanted / rest - 1
             tension = traction * self.bulk_kpa * np.log(wanted / rest)
             start = u * (share / before) if abs(before) > 1e-6 and abs(share / before) < 3 else u
-            sag = np.log(wanted / rest) / np.log(SAG_RATIO)
+            sag = depth_of(wanted / rest) * (1.0 if wanted < rest else -1.0)
             force = tension * self.pull + (wanted - rest) * self.wanted + sag * self.weight
             springs = Springs(self.springs.matrix, self.springs.force + force)
             scene = Scene(self.mesh, self.material, springs, tree=tree)
@@ -139,7 +139,9 @@ def _wall(mesh: TetMesh, side: Side, where: Regions, feet: float) -> tuple[bsr_m
     stiffness = np.where(where.diaphragm, DIAPHRAGM_KPA_PER_MM, WALL_KPA_PER_MM) * area
     along = np.where(where.diaphragm[:, None], [0.0, 0.0, feet], normal)
     down = float((area * feet * normal[:, 2])[where.diaphragm].sum())
-    step = np.where(chest, CHEST_SHARE / area[chest].sum(), 0.0) + np.where(where.diaphragm, (1 - CHEST_SHARE) / down, 0.0)
+    step = np.where(chest, CHEST_SHARE / area[chest].sum(), 0.0) + np.where(
+        where.diaphragm, (1 - CHEST_SHARE) / down, 0.0
+    )
     blocks, force = np.zeros((len(mesh.points), 3, 3)), np.zeros_like(mesh.points)
     blocks[surface.nodes] = stiffness[:, None, None] * along[:, :, None] * along[:, None, :]
     force[surface.nodes] = (stiffness * step)[:, None] * along

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy import ndimage
-from scipy.sparse import coo_matrix, csr_matrix, diags, vstack
+from scipy.sparse import coo_matrix, csr_matrix, diags
 
 from poro.arrays import Array
 from poro.breathing.cavity import rising
@@ -49,8 +49,8 @@ STILL_MM = 0.3
 class Thorax:
     """Three bodies in one mesh that share no node. lung: (nl,) nodes that belong to the lung, first in the mesh;
     walls: inner surface of chest and of what is below, in nodes of the mesh; patch: (t,) of every triangle of `walls`,
-    -1 for none; gap: (k,) mm between the lung's border and the walls at rest; anchors: springs that hold the chest and the lung's
-    bronchi; load: (n, 3) kPa mm2 on the lung at the end of an inspiration.
+    -1 for none; gap: (k,) mm between the lung's border and the walls at rest; anchors: springs that hold
+    the chest and the lung's bronchi; load: (n, 3) kPa mm2 on the lung at the end of an inspiration.
     """
 
     mesh: TetMesh
@@ -220,7 +220,7 @@ def _distances(
 
 
 def _contact(scene: Thorax, u: Array) -> Springs:
-    """Springs along the walls' normals that keep the gap which lung and walls have at rest, wherever the lung slid to."""
+    """Springs along the walls' normals that keep the gap at rest between lung and walls, wherever the lung slid to."""
     border = scene.lung.boundary
     walls = scene.walls.moved(scene.walls.points + u[scene.walls.nodes])
     here = border.points + u[border.nodes]
@@ -254,9 +254,7 @@ def _patch_forces(scene: Thorax, u: Array) -> Array:
     return forces
 
 
-def _walls(
-    bodies: Sequence[TetMesh], starts: Array, lung: TetMesh, points: Array
-) -> tuple[TriSurface, Array]:
+def _walls(bodies: Sequence[TetMesh], starts: Array, lung: TetMesh, points: Array) -> tuple[TriSurface, Array]:
     """Faces of the bodies that look at the lung, and the patch of each."""
     triangles, is_below = [], []
     for number, body in enumerate(bodies):

@@ -1,4 +1,4 @@
-"""A breathing case: the files of its folder, by `breath.toml` or by their usual names. Landmarks are named, not read."""
+"""A breathing case: the files of its folder, by `breath.toml` or by their usual names. Landmarks are not read."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ def read_rows(path: Path, columns: int, head: str) -> Array:
     try:
         rows = np.array([[float(value) for value in line.split(",")] for line in lines[1:]])
     except ValueError as error:
-        raise InputRefused(f"{path} holds what is no number, or rows of unlike length ({error}); write {head}.") from error
+        raise InputRefused(f"{path} has no numbers, or rows of unlike length ({error}); write {head}.") from error
     if rows.ndim != 2 or rows.shape[1] != columns or not np.isfinite(rows).all():
         raise InputRefused(f"{path} has rows that are not {columns} finite numbers; write {head}.")
     return rows
@@ -154,8 +154,9 @@ def _usual(folder: Path) -> BreathFile:
         return name if (folder / name).exists() else None
 
     for mask_in, mask_ex, image_in, image_ex in USUAL:
-        masks, images = Pair(inspiration=there(mask_in), expiration=there(mask_ex)), Pair(
-            inspiration=there(image_in), expiration=there(image_ex)
+        masks, images = (
+            Pair(inspiration=there(mask_in), expiration=there(mask_ex)),
+            Pair(inspiration=there(image_in), expiration=there(image_ex)),
         )
         if masks.inspiration or masks.expiration:
             return BreathFile(images=images, masks=masks, landmarks=One(file=there(LANDMARKS)))

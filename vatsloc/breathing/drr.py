@@ -48,7 +48,9 @@ class Radiograph:
         return np.asarray(np.clip(np.rint(1000 * self.integrals), 0, 65535), np.uint16)
 
 
-def radiograph(ct: Volume, view: str, pixels: int = 256, source_mm: float = 1000.0, detector_mm: float = 400.0) -> Radiograph:
+def radiograph(
+    ct: Volume, view: str, pixels: int = 256, source_mm: float = 1000.0, detector_mm: float = 400.0
+) -> Radiograph:
     """What a detector `detector_mm` behind the image's centre sees from a source `source_mm` before it.
 
     ct: HU, axes along R, A, S. view: "frontal" or "lateral".

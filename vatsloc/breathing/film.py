@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from poro.arrays import Array
+from poro.breathing.elastic import caudal
 from registration.volume import Volume
 from vatsloc.breathing.motion import Motion
 
@@ -17,16 +18,19 @@ _MARGIN_MM = 25.0
 
 
 def frames(motion: Motion) -> list[Array]:
-    """One picture (h, w, 3) BGR per state: the lungs' shadow from the front, and arrows from the first scan's places."""
+    """One picture (h, w, 3) BGR per state: the lungs from the front, and arrows from the first scan's places."""
     every = np.concatenate([nodes for lung in motion.lungs for nodes in lung.states])
     lower, upper = every.min(axis=0) - _MARGIN_MM, every.max(axis=0) + _MARGIN_MM
     scale = HEIGHT / (upper[2] - lower[2])
     width = int(scale * (upper[0] - lower[0]))
     largest = max(np.linalg.norm(s - lung.mesh.points, axis=1).max() for lung in motion.lungs for s in lung.states)
 
+    feet = caudal(motion.lungs[0].mesh)
+
     def pixel(points: Array) -> Array:
-        # As a radiologist looks at it: the patient's right on the left.
-        return np.stack([scale * (upper[0] - points[:, 0]), scale * (upper[2] - points[:, 2])], axis=1)
+        # As a radiologist looks at it: head up, the patient's right on the left. Some masks are stacked feet up.
+        height = upper[2] - points[:, 2] if feet < 0 else points[:, 2] - lower[2]
+        return np.stack([scale * (upper[0] - points[:, 0]), scale * height], axis=1)
 
     pictures = []
     for n in range(motion.count):
@@ -35,15 +39,18 @@ def frames(motion: Motion) -> list[Array]:
             border = lung.mesh.boundary
             here = lung.states[n]
             triangles = np.rint(pixel(here[border.nodes])[border.triangles]).astype(np.int32)
-            cv2.fillPoly(picture, list(triangles), (96, 84, 72))
+            for triangle in triangles:
+                cv2.fillConvexPoly(picture, triangle, (96, 84, 72))
         for lung in motion.lungs:
             here, start = lung.states[n], lung.mesh.points
             chosen = np.linspace(0, len(start) - 1, min(_ARROWS, len(start))).astype(int)
             length = np.linalg.norm(here - start, axis=1) / max(largest, 1e-6)
             colours = cv2.applyColorMap((255 * length[chosen]).astype(np.uint8)[:, None], cv2.COLORMAP_TURBO)[:, 0]
             for a, b, colour in zip(pixel(start[chosen]), pixel(here[chosen]), colours, strict=True):
-                ends = [tuple(int(round(v)) for v in p) for p in (a, b)]
-                cv2.arrowedLine(picture, ends[0], ends[1], tuple(int(c) for c in colour), 1, cv2.LINE_AA, tipLength=0.25)
+                ends = [tuple(round(float(v)) for v in p) for p in (a, b)]
+                cv2.arrowedLine(
+                    picture, ends[0], ends[1], tuple(int(c) for c in colour), 1, cv2.LINE_AA, tipLength=0.25
+                )
         text = f"state {n}: {motion.volume_ml(n):.0f} ml"
         cv2.putText(picture, text, (10, 22), cv2.FONT_HERSHEY_SIMPLEX, 0.55, (230, 230, 230), 1, cv2.LINE_AA)
         cv2.putText(picture, "R", (8, HEIGHT // 2), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (230, 230, 230), 1, cv2.LINE_AA)

@@ -36,6 +36,12 @@ from vatsloc.maps import MeshMap, covered, sampled
 FIELD_MM, BODY_MM, EDGE_MM, DRR_MM = 4.0, 5.0, 24.0, 2.5
 """Voxels of fields, of the body's mask and of what radiographs are made of; edges of the body's tetrahedra."""
 TUMOUR_HU = 40.0
+CAPTIONS = {
+    "coronal": "CT, coronal",
+    "sagittal": "CT, sagittal",
+    "frontal": "Radiograph, frontal",
+    "lateral": "Radiograph, lateral",
+}
 BODY_HU = -500.0
 
 
@@ -73,7 +79,9 @@ def write_images(
         back, density = _to_the_scan(motion, followed, grid, n)
         warped = _warped(ct, back, density)
         write_volume(folder / f"ct_{n:03d}.nii.gz", warped, axes)
-        write_field(folder / f"from-scan_to-state{n:03d}_mode-points_xfm.nii.gz", _to_the_state(motion, followed, grid, n), axes)
+        write_field(
+            folder / f"from-scan_to-state{n:03d}_mode-points_xfm.nii.gz", _to_the_state(motion, followed, grid, n), axes
+        )
         views["coronal"].append(slice_of(warped, 1, middle[1]))
         views["sagittal"].append(slice_of(warped, 0, motion.lungs[0].mesh.points[:, 0].mean()))
         ball = None if case.tumour is None else motion.moved(_ball(case.tumour), n)
@@ -86,11 +94,10 @@ def write_images(
             picture = _outlined(shot, ball)
             (folder / f"drr_{view}_{n:03d}.png").write_bytes(as_png(picture))
             views[view].append(picture)
-    captions = {"coronal": "CT, coronal", "sagittal": "CT, sagittal", "frontal": "Radiograph, frontal", "lateral": "Radiograph, lateral"}
     details: dict[str, Any] = {"body": followed.table}
     if centres:
         details["tumour_lps"] = centres
-    return [Strip(captions[name], pictures) for name, pictures in views.items()], details
+    return [Strip(CAPTIONS[name], pictures) for name, pictures in views.items()], details
 
 
 def follow(ct: Volume, motion: Motion) -> Followed:

@@ -1,4 +1,4 @@
-"""The lungs of a case as meshes: masks read or made from the images, mended, parted, and the same sides in both scans."""
+"""The lungs of a case as meshes: masks read or made from images, mended, parted, the same sides in both scans."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from poro.breathing.elastic import Lung
+from poro.breathing.elastic import Lung, depth_of
 from poro.mesh import TetMesh, stuff
 from registration.volume import Mask
 from vatsloc.breathing.case import BreathCase, Scan
 from vatsloc.breathing.masks import CleanLungs, lungs_of, to_the_back
 from vatsloc.errors import InputRefused
 from vatsloc.frames import Side
-from vatsloc.imaging.lungs import lung_halves
 from vatsloc.imaging.lattice import on_grid
+from vatsloc.imaging.lungs import lung_halves
 
 EDGE_MM = 12.0
 MUCH = 2.5
@@ -23,12 +23,13 @@ MUCH = 2.5
 
 @dataclass(frozen=True)
 class Pair:
-    """One lung in both scans: masks, and meshes made of them."""
+    """One lung in both scans: masks, and meshes made of them. depth: of the breath (`depth_of`)."""
 
     side: Side
     inspired: Mask
     expired: Mask
     lung: Lung
+    depth: float
 
 
 def both_scans(case: BreathCase, edge_mm: float = EDGE_MM) -> tuple[list[Pair], list[str]]:
@@ -51,9 +52,10 @@ def both_scans(case: BreathCase, edge_mm: float = EDGE_MM) -> tuple[list[Pair], 
     pairs = []
     for side in sides:
         full, rest = inspired.lungs[side], expired.lungs[side]
-        if case.expiration.image is None:
-            rest = to_the_back(rest, full)
         ratio = float(full.inside.sum() * full.grid.spacing.prod() / (rest.inside.sum() * rest.grid.spacing.prod()))
+        depth = depth_of(ratio)
+        if case.expiration.image is None and depth > 0:
+            rest = to_the_back(rest, full)
         if not 1 / MUCH < ratio < MUCH * 1.5:
             raise InputRefused(
                 f"The {side} lung is {ratio:.2f} times as large in the inspiration as in the expiration, which no "
@@ -61,7 +63,7 @@ def both_scans(case: BreathCase, edge_mm: float = EDGE_MM) -> tuple[list[Pair], 
             )
         if ratio < 1:
             notes.append(f"The {side} lung is smaller in the inspiration ({ratio:.2f} of the expiration's volume).")
-        pairs.append(Pair(side, full, rest, Lung(side, meshed(full, edge_mm), meshed(rest, edge_mm))))
+        pairs.append(Pair(side, full, rest, Lung(side, meshed(full, edge_mm), meshed(rest, edge_mm)), depth))
     return pairs, notes
 
 

@@ -46,7 +46,7 @@ def lungs_of(mask: Mask, name: str) -> CleanLungs:
     notes: list[str] = []
     inside, mended = fill_slices(inside, grid.spacing[2])
     if mended:
-        notes.append(f"The {name} mask: {mended} slices were missing or torn and were filled in from those beside them.")
+        notes.append(f"The {name} mask: {mended} slices were missing or torn and were filled in.")
     inside, strays = _without_strays(inside)
     if strays * voxel_ml > 1:
         notes.append(f"The {name} mask: {strays * voxel_ml:.0f} ml of stray bits were left out.")
@@ -73,14 +73,20 @@ def to_the_back(expired: Mask, inspired: Mask) -> Mask:
     """Expired lung filled up to the back wall of the inspired one; voxels along the patient's axes.
 
     On a patient's back, spine and back ribs lie still; but what lies lowest may grow so dense in expiration that a
-    threshold leaves it out of the mask.
+    threshold leaves it out of the mask. Where even the nearest tenth of the back lies off, the wall itself has moved
+    by as much.
     """
     inspired = resample_mask(inspired, expired.grid)
     step = -1 if expired.ras_from_ijk[1, 1] < 0 else 1
     lung, full = expired.inside[:, ::step], inspired.inside[:, ::step]
-    # Running from back to front: behind the expired lung, and not behind the inspired one.
+    both = lung.any(axis=1) & full.any(axis=1)
+    off = (lung.argmax(axis=1) - full.argmax(axis=1))[both]
+    moved = max(round(float(np.percentile(off, 10))), 0) if both.any() else 0
+    wall = np.zeros_like(full)
+    wall[:, moved:] = full[:, : full.shape[1] - moved]
+    # Running from back to front: behind the expired lung, and not behind the wall.
     behind = ~np.logical_or.accumulate(lung, axis=1) & lung.any(axis=1, keepdims=True)
-    filled = lung | (behind & np.logical_or.accumulate(full, axis=1))
+    filled = lung | (behind & np.logical_or.accumulate(wall, axis=1))
     return Mask(filled[:, ::step], expired.ras_from_ijk)
 
 
@@ -96,13 +102,13 @@ def fill_slices(inside: Array, spacing_mm: float) -> tuple[Array, int]:
         return inside, 0
     bad = np.zeros(inside.shape[2], bool)
     bad[full[0] : full[-1] + 1] = area[full[0] : full[-1] + 1] == 0
-    for k in range(full[0] + 1, full[-1]):
+    for k in range(int(full[0]) + 1, int(full[-1])):
         if not bad[k] and area[k - 1] and area[k + 1]:
             shared = inside[:, :, k - 1] & inside[:, :, k + 1]
             bad[k] = shared.any() and (inside[:, :, k] & shared).sum() < TORN_SHARE * shared.sum()
     good = np.flatnonzero((area > 0) & ~bad)
     mended = 0
-    for k in np.flatnonzero(bad):
+    for k in np.flatnonzero(bad).tolist():
         below, above = good[good < k], good[good > k]
         if len(below) == 0 or len(above) == 0 or (above[0] - below[-1]) * spacing_mm > GAP_MM:
             continue
@@ -130,7 +136,7 @@ def _without_strays(inside: Array) -> tuple[Array, int]:
 
 
 def _halves(inside: Array, grid: Grid) -> dict[Side, Array]:
-    """The lungs of a mask by side: its two largest pieces if they lie side by side, or one parted, or one lung alone."""
+    """The lungs of a mask by side: its two largest pieces if side by side, or one parted, or one lung alone."""
     labels, count = ndimage.label(inside)
     size = np.bincount(labels.ravel(), minlength=count + 1)[1:]
     order = np.argsort(size)[::-1] + 1
@@ -212,7 +218,7 @@ def _hull(slice_: Array) -> Array:
 
 
 def _joined(lung: Array, spacing: Array) -> tuple[Array, int]:
-    """The lung in one piece, closed with a ball as small as will do; else its largest piece and what it lacks, voxels."""
+    """The lung in one piece, closed with a ball as small as will do; else its largest piece and what it lacks."""
     for radius in (0.0, *JOIN_MM):
         closed = lung if radius == 0 else lung | close(lung, radius, spacing)
         labels, count = ndimage.label(closed)

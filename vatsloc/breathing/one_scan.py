@@ -13,6 +13,7 @@ import numpy as np
 
 from poro.arrays import Array
 from poro.breathing.one_scan import TRACTION, OneScan, one_scan
+from registration.volume import Mask
 from vatsloc.breathing.case import BreathCase, Scan
 from vatsloc.breathing.lungs import masks_of, meshed
 from vatsloc.breathing.motion import IN, OUT, LungMotion, Motion
@@ -57,7 +58,10 @@ def drive(case: BreathCase, count: int, say: Callable[[str], None]) -> Motion:
         u = np.stack([np.zeros_like(mesh.points), *(s.u for s in settled)])
         p = np.array([0.0, *(1000 * s.suction_kpa for s in settled)])
         lag = _lag(scene, rest * (1 + (full / start - 1) / 2), case.hysteresis)
-        states = tuple(mesh.points + _between(u, knots, s) + d * 4 * s * (1 - s) * lag for s, d in zip(share, _way(share), strict=True))
+        states = tuple(
+            mesh.points + _between(u, knots, s) + d * 4 * s * (1 - s) * lag
+            for s, d in zip(share, _way(share), strict=True)
+        )
         lungs.append(LungMotion(side, mesh, states))
         pressures.append(np.interp(share, knots, p))
     pressure = tuple(float(v) for v in np.mean(pressures, axis=0))
@@ -88,7 +92,7 @@ def _full_ml(case: BreathCase, scan: Scan, at_scan: tuple[float, int], direction
 
 
 def _lag(scene: OneScan, half_mm3: float, hysteresis: float) -> Array:
-    """How far tissue is ahead on the way in, halfway (n, 3) mm: the diaphragm then leads, and on the way out the ribs."""
+    """How far tissue is ahead on the way in, halfway (n, 3) mm: the diaphragm leads, and on the way out the ribs."""
     if hysteresis == 0.0:
         return np.zeros_like(scene.mesh.points)
     more = scene.states([half_mm3], TRACTION * (1 + hysteresis))[0].u
@@ -108,5 +112,5 @@ def _between(u: Array, knots: Array, share: float) -> Array:
     return np.asarray((1 - part) * u[k] + part * u[k + 1])
 
 
-def _ml(mask) -> float:  # type: ignore[no-untyped-def]
+def _ml(mask: Mask) -> float:
     return float(mask.inside.sum() * mask.grid.spacing.prod()) / 1000

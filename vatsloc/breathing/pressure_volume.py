@@ -6,14 +6,15 @@ number, so that at the end of inspiration the suction is what the pressure-volum
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from poro.arrays import Array
-from poro.breathing.cavity import inflating
-from poro.breathing.elastic import Breathing
+from poro.breathing.cavity import Inflating, inflating
+from poro.breathing.elastic import acting_at
 from poro.breathing.inflation import fill
 from poro.breathing.mesh_quality import Shares, smooth, violations
 from poro.breathing.pressure_volume import pressure_volume
@@ -34,15 +35,15 @@ def drive(case: BreathCase, count: int, say: Callable[[str], None]) -> Motion:
     lungs, suctions, quality = [], [], []
     for pair in pairs:
         say(f"{pair.side} lung: {count} phases of inflation ...")
-        scene = inflating(pair.lung, Breathing())
-        found = list(fill(scene.at, progress[1:], lambda s, scene=scene: scene.volume(FULL * s), scene.guess))
+        scene = inflating(pair.lung, acting_at(pair.depth))
+        found = list(fill(scene.at, progress[1:].tolist(), partial(_volume, scene), scene.guess))
         states = (scene.mesh.points, *(scene.mesh.points + phase.u for phase in found))
         lungs.append(LungMotion(pair.side, scene.mesh, states))
         suctions.append([0.0, *(1000 * phase.suction_kpa for phase in found)])
         quality.append((pair.side, violations(scene.mesh), violations(smooth(scene.mesh))))
         if not all(phase.settled for phase in found):
             slow = sum(not phase.settled for phase in found)
-            notes.append(f"{pair.side} lung: {slow} of {count - 1} phases were still moving by more than 0.3 mm a step.")
+            notes.append(f"{pair.side} lung: {slow} of {count - 1} phases still moved by over 0.3 mm a step.")
     by_tissue = np.mean(suctions, axis=0)
     volumes = np.array([sum(lung.volume_ml(n) for lung in lungs) for n in range(count)])
     curve = pressure_volume(volumes - volumes[0], volumes[0])
@@ -55,12 +56,18 @@ def drive(case: BreathCase, count: int, say: Callable[[str], None]) -> Motion:
     return Motion("pressure-volume", IN, tuple(lungs), pressure, count - 1, tuple(notes), details)
 
 
+def _volume(scene: Inflating, share: float) -> float:
+    return scene.volume(FULL * share)
+
+
 def _pressures(volumes: Array, curve: Array, tissue: Array) -> dict[str, Any]:
-    rows = [[n, f"{v:.0f}", f"{c:.0f}", f"{t:.0f}"] for n, (v, c, t) in enumerate(zip(volumes, curve, tissue, strict=True))]
+    rows = [
+        [n, f"{v:.0f}", f"{c:.0f}", f"{t:.0f}"] for n, (v, c, t) in enumerate(zip(volumes, curve, tissue, strict=True))
+    ]
     return {"title": "Pressure and volume", "head": ["phase", "ml", "curve, Pa", "tissue, Pa"], "rows": rows}
 
 
-def _quality(lungs: list[tuple[str, Shares, Shares]]) -> dict[str, Any]:
+def _quality(lungs: Sequence[tuple[str, Shares, Shares]]) -> dict[str, Any]:
     rows = []
     for side, before, after in lungs:
         for name, shares_ in (("as stuffed", before), ("after descent on V / L^3", after)):

@@ -6,14 +6,17 @@ Once fitted they are generative: any history of them is a motion. Here they rise
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from poro.arrays import Array
-from poro.breathing.elastic import Breathing
+from poro.breathing.elastic import acting_at
 from poro.breathing.regional import Thorax, fit_pressures, press, thorax
 from poro.mesh import locate
+from poro.mesh.locate import Location
 from poro.mesh.tetmesh import signed_volumes
 from vatsloc.breathing.case import BreathCase
 from vatsloc.breathing.lungs import Pair, both_scans
@@ -31,13 +34,11 @@ def drive(case: BreathCase, count: int, say: Callable[[str], None], see_landmark
     lungs, pressures, rows = [], [], []
     for pair in pairs:
         try:
-            scene = thorax(pair.expired.inside, pair.expired.ras_from_ijk, pair.lung, Breathing())
+            scene = thorax(pair.expired.inside, pair.expired.ras_from_ijk, pair.lung, acting_at(pair.depth))
         except ValueError as refusal:
             raise InputRefused(f"No chest can be built about the {pair.side} lung: {refusal}.") from refusal
         matched = _matched(case, pair) if see_landmarks else None
-        fit = fit_pressures(
-            scene, pair.lung.inspired.boundary, matched, lambda text, side=pair.side: say(f"{side} lung: {text}")
-        )
+        fit = fit_pressures(scene, pair.lung.inspired.boundary, matched, partial(_say, say, pair.side))
         say(f"{pair.side} lung: {count - 1} states of the fitted pressures ...")
         states = states_of(scene, fit.state.p, fit.state.u, count)
         lungs.append(LungMotion(pair.side, scene.lung, states))
@@ -55,12 +56,16 @@ def drive(case: BreathCase, count: int, say: Callable[[str], None], see_landmark
     return Motion("regional-pressure", IN, tuple(lungs), pressure, count - 1, tuple(notes), details)
 
 
+def _say(say: Callable[[str], None], side: str, text: str) -> None:
+    say(f"{side} lung: {text}")
+
+
 def states_of(scene: Thorax, p: Array, end: Array, count: int) -> tuple[Array, ...]:
     """Lung's nodes in `count` states from rest to `end`, equal steps of volume apart: the pressures rise together."""
     size = len(scene.lung.points)
     progress = np.linspace(0.0, 1.0, max(min(count, 6), 2))
     found, u = [np.zeros_like(end)], np.zeros_like(end)
-    for before, share in zip(progress[:-2], progress[1:-1], strict=True):
+    for before, share in pairwise(progress[:-1]):
         u = press(scene, share * p, u + (share - before) * end, share).u
         found.append(u)
     found.append(end)
@@ -78,7 +83,7 @@ def states_of(scene: Thorax, p: Array, end: Array, count: int) -> tuple[Array, .
     return tuple(states)
 
 
-def _matched(case: BreathCase, pair: Pair):  # type: ignore[no-untyped-def]
+def _matched(case: BreathCase, pair: Pair) -> tuple[Location, Array, Array] | None:
     """Landmarks that lie in a lung, for E2."""
     if case.landmarks is None:
         raise InputRefused(f"{case.folder} has no landmarks to fit to; leave --fit-landmarks out.")

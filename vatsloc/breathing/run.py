@@ -10,8 +10,11 @@ from typing import Any
 
 import numpy as np
 
+import vatsloc.breathing.one_scan as one_scan
+import vatsloc.breathing.pressure_volume as pressure_volume
+import vatsloc.breathing.regional_pressure as regional_pressure
+import vatsloc.breathing.surface as surface
 from poro.mesh.tetmesh import signed_volumes
-from vatsloc.breathing import one_scan, pressure_volume, regional_pressure, surface
 from vatsloc.breathing.case import BreathCase, read_breath
 from vatsloc.breathing.film import animated, as_png, frames
 from vatsloc.breathing.images import write_images
@@ -70,7 +73,10 @@ def breathe_case(
         (partial / "arrows.png").write_bytes(as_png(pictures[-1 if motion.end is None else motion.end]))
         if views:
             (partial / "coronal.webp").write_bytes(animated([np.stack([p] * 3, axis=2) for p in views[0].pictures]))
-        strips, tables = [Strip("From the front, arrows from the places in the first scan", pictures), *views], _tables(result)
+        strips, tables = (
+            [Strip("From the front, arrows from the places in the first scan", pictures), *views],
+            _tables(result),
+        )
         (partial / PAGE).write_text(page(case.name, result, strips, tables), encoding="utf-8")
         (partial / RESULT).write_text(json.dumps(result, indent=1, allow_nan=False) + "\n", encoding="utf-8")
     return result

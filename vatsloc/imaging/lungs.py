@@ -184,7 +184,7 @@ def _cut(joined: Array, grid: Grid, midline: float) -> list[Array]:
 
 
 def part_joined(joined: Array, grid: Grid) -> tuple[Array, Array] | None:
-    """Two large parts of a mask that touch, eroded until they fall apart and grown back together; None if they do not."""
+    """Two large parts of a mask that touch, eroded until they fall apart and grown back; None if they do not."""
     spacing = grid.spacing
     depth = ndimage.distance_transform_edt(joined, sampling=spacing)
     for radius in np.arange(2.0, 24.0, 2.0):
