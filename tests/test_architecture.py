@@ -89,7 +89,7 @@ FOREIGN: dict[str, set[str]] = {
 }
 """Package -> packages of ours that it must not know. What phantoms load is tested beside their other tests."""
 
-MAKERS = {"synthetic", "study", "breathing"}
+MAKERS = {"synthetic", "study"}
 """Rooms of vatsloc that may know phantoms. A run and its evaluation do not: they treat a phantom as any other case."""
 
 

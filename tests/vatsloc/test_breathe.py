@@ -15,6 +15,7 @@ from poro.arrays import Array
 from registration.volume import Mask, Volume
 from vatsloc.breathing.case import read_breath
 from vatsloc.breathing.drr import WATER_PER_MM, radiograph
+from vatsloc.breathing.lungs import both_scans
 from vatsloc.breathing.masks import lungs_of
 from vatsloc.breathing.motion import IN, OUT, LungMotion, Motion
 from vatsloc.breathing.run import breathe_case
@@ -246,3 +247,15 @@ def test_a_radiograph_of_water_adds_up_its_thickness_and_a_bead_appears_in_its_p
     # Head up; the patient's right on the left of a frontal view, his front on the left of a lateral one.
     assert row < 100
     assert column < 100
+
+
+def test_a_back_that_a_threshold_lost_is_filled_in_again(person: Path) -> None:
+    whole = both_scans(read_breath(person))[0]
+    lost = lungs(SQUEEZE)
+    y = np.arange(SHAPE[1]) * SPACING + ORIGIN[1]
+    lost[np.ix_(np.arange(SHAPE[0]), y < -15, np.arange(35, 60))] = False
+    save(person / "lungs_expiration.nii.gz", lost)
+    mended = both_scans(read_breath(person))[0]
+    for before, after in zip(whole, mended, strict=True):
+        assert after.side == before.side
+        assert after.lung.expired.volumes.sum() == pytest.approx(before.lung.expired.volumes.sum(), rel=0.05)

@@ -54,7 +54,7 @@ def both_scans(case: BreathCase, edge_mm: float = EDGE_MM) -> tuple[list[Pair], 
         full, rest = inspired.lungs[side], expired.lungs[side]
         ratio = float(full.inside.sum() * full.grid.spacing.prod() / (rest.inside.sum() * rest.grid.spacing.prod()))
         depth = depth_of(ratio)
-        if case.expiration.image is None and depth > 0:
+        if case.expiration.image is None:
             rest = to_the_back(rest, full)
         if not 1 / MUCH < ratio < MUCH * 1.5:
             raise InputRefused(

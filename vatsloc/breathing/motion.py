@@ -69,6 +69,13 @@ class Motion:
         return np.concatenate([lung.states[state] for lung in self.lungs]), np.concatenate(tets)
 
 
+def between(u: Array, knots: Array, share: float) -> Array:
+    """Displacement (n, 3) at a share of the way, linear between those (k, n, 3) at the knots (k,)."""
+    k = min(int(np.searchsorted(knots, share, "right")) - 1, len(knots) - 2)
+    part = (share - knots[k]) / (knots[k + 1] - knots[k])
+    return np.asarray((1 - part) * u[k] + part * u[k + 1])
+
+
 def shares(count: int) -> Array:
     """Progress (count,) of the motion, 0 at the first scan and 1 at the other one."""
     return np.linspace(0.0, 1.0, count)

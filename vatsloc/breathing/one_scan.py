@@ -16,7 +16,7 @@ from poro.breathing.one_scan import TRACTION, OneScan, one_scan
 from registration.volume import Mask
 from vatsloc.breathing.case import BreathCase, Scan
 from vatsloc.breathing.lungs import masks_of, meshed
-from vatsloc.breathing.motion import IN, OUT, LungMotion, Motion
+from vatsloc.breathing.motion import IN, OUT, LungMotion, Motion, between
 from vatsloc.breathing.signal import PERIOD_S, quiet_breath, sampled
 from vatsloc.errors import InputRefused
 
@@ -59,7 +59,7 @@ def drive(case: BreathCase, count: int, say: Callable[[str], None]) -> Motion:
         p = np.array([0.0, *(1000 * s.suction_kpa for s in settled)])
         lag = _lag(scene, rest * (1 + (full / start - 1) / 2), case.hysteresis)
         states = tuple(
-            mesh.points + _between(u, knots, s) + d * 4 * s * (1 - s) * lag
+            mesh.points + between(u, knots, s) + d * 4 * s * (1 - s) * lag
             for s, d in zip(share, _way(share), strict=True)
         )
         lungs.append(LungMotion(side, mesh, states))
@@ -104,12 +104,6 @@ def _way(share: Array) -> Array:
     """+1 where the motion goes on, -1 where it returns."""
     step = np.gradient(share)
     return np.where(step >= 0, 1.0, -1.0)
-
-
-def _between(u: Array, knots: Array, share: float) -> Array:
-    k = min(int(np.searchsorted(knots, share, "right")) - 1, len(knots) - 2)
-    part = (share - knots[k]) / (knots[k + 1] - knots[k])
-    return np.asarray((1 - part) * u[k] + part * u[k + 1])
 
 
 def _ml(mask: Mask) -> float:

@@ -20,9 +20,11 @@ from poro.breathing.mesh_quality import Shares, smooth, violations
 from poro.breathing.pressure_volume import pressure_volume
 from vatsloc.breathing.case import BreathCase
 from vatsloc.breathing.lungs import both_scans
-from vatsloc.breathing.motion import IN, LungMotion, Motion, shares
+from vatsloc.breathing.motion import IN, LungMotion, Motion, between, shares
 
 EDGE_MM = 16.0
+EQUILIBRIA = 5
+"""How many are computed; phases between lie on a line from one to the next."""
 FULL = 0.99
 """Share of the way to the inspired volume at which the lung stops: corners of the cavity it would only fill at any
 suction."""
@@ -32,18 +34,20 @@ def drive(case: BreathCase, count: int, say: Callable[[str], None]) -> Motion:
     """From expiration to inspiration in `count` phases of equal volume steps."""
     pairs, notes = both_scans(case, EDGE_MM)
     progress = shares(count)
+    knots = shares(min(count, EQUILIBRIA + 1))
     lungs, suctions, quality = [], [], []
     for pair in pairs:
-        say(f"{pair.side} lung: {count} phases of inflation ...")
+        say(f"{pair.side} lung: {len(knots) - 1} equilibria of its inflation ...")
         scene = inflating(pair.lung, acting_at(pair.depth))
-        found = list(fill(scene.at, progress[1:].tolist(), partial(_volume, scene), scene.guess))
-        states = (scene.mesh.points, *(scene.mesh.points + phase.u for phase in found))
+        found = list(fill(scene.at, knots[1:].tolist(), partial(_volume, scene), scene.guess))
+        u = np.stack([np.zeros_like(scene.mesh.points), *(phase.u for phase in found)])
+        states = tuple(scene.mesh.points + between(u, knots, s) for s in progress)
         lungs.append(LungMotion(pair.side, scene.mesh, states))
-        suctions.append([0.0, *(1000 * phase.suction_kpa for phase in found)])
+        suctions.append(np.interp(progress, knots, [0.0, *(1000 * phase.suction_kpa for phase in found)]))
         quality.append((pair.side, violations(scene.mesh), violations(smooth(scene.mesh))))
         if not all(phase.settled for phase in found):
             slow = sum(not phase.settled for phase in found)
-            notes.append(f"{pair.side} lung: {slow} of {count - 1} phases still moved by over 0.3 mm a step.")
+            notes.append(f"{pair.side} lung: {slow} of {len(knots) - 1} equilibria still moved by over 0.3 mm a step.")
     by_tissue = np.mean(suctions, axis=0)
     volumes = np.array([sum(lung.volume_ml(n) for lung in lungs) for n in range(count)])
     curve = pressure_volume(volumes - volumes[0], volumes[0])

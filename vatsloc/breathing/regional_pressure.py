@@ -20,7 +20,7 @@ from poro.mesh.locate import Location
 from poro.mesh.tetmesh import signed_volumes
 from vatsloc.breathing.case import BreathCase
 from vatsloc.breathing.lungs import Pair, both_scans
-from vatsloc.breathing.motion import IN, LungMotion, Motion, shares
+from vatsloc.breathing.motion import IN, LungMotion, Motion, between, shares
 from vatsloc.breathing.score import read_landmarks
 from vatsloc.errors import InputRefused
 
@@ -74,11 +74,7 @@ def states_of(scene: Thorax, p: Array, end: Array, count: int) -> tuple[Array, .
     order = np.argsort(volume)
     at = np.interp(wanted, volume[order], progress[order])
     every = np.stack([f[:size] for f in found])
-    states = []
-    for share in at:
-        k = min(int(np.searchsorted(progress, share, "right")) - 1, len(progress) - 2)
-        part = (share - progress[k]) / (progress[k + 1] - progress[k])
-        states.append(scene.lung.points + (1 - part) * every[k] + part * every[k + 1])
+    states = [scene.lung.points + between(every, progress, share) for share in at]
     states[0], states[-1] = scene.lung.points, scene.lung.points + every[-1]
     return tuple(states)
 
