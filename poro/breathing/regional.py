@@ -15,7 +15,7 @@ from scipy.sparse import coo_matrix, csr_matrix, diags
 
 from poro.arrays import Array
 from poro.breathing.cavity import rising
-from poro.breathing.elastic import Breathing, Lung, caudal
+from poro.breathing.elastic import Breathing, Lung, Side, caudal, hilum
 from poro.breathing.equilibrium import Springs
 from poro.fem.constraints import point_constraints
 from poro.fem.forms import tangent_stiffness
@@ -34,11 +34,14 @@ STICK_KPA_PER_MM = 0.5
 """Sliding contact that neither lets bodies part nor enter each other: it gives way by 1 mm at 0.5 kPa."""
 TOUCH_MM = 10.0
 """Farther from a wall at rest the lung does not touch it."""
-ANCHOR = 0.02
-"""Stiffness, over the tissue's own, by which the chest is held everywhere; its back is held 100 times as firmly."""
+ANCHOR = 0.2
+"""Stiffness, over the tissue's own, by which the chest is held everywhere; back and mediastinum are held 30 times as
+firmly. The shell is no closed ring, and a round lung would turn in it."""
 SURFACE_ROUNDS, INNER = 12, 3
 PRIOR_MM_PER_KPA = 0.5
 """Root mean square distance that a pressure of 1 kPa is held to be worth."""
+TETHER, HILUM_MM = 0.3, 25.0
+"""Stiffness, over the tissue's own, by which the hilum is held, and how far that reaches; Fuerst misses it."""
 REACH_MM = 15.0
 """How far a step of the fit may move any node."""
 STILL_MM = 0.3
@@ -122,7 +125,7 @@ def thorax(inside: Array, ras_from_ijk: Array, pair: Lung, acting: Breathing, ed
     springs, load = np.zeros(3 * len(points)), np.zeros_like(points)
     bronchi, load[: len(lung.points)] = rising(pair, acting, LUNG)
     springs[: 3 * len(lung.points)] = bronchi.diagonal()
-    anchors = (_anchors(bodies, starts, points, towards) + diags(springs)).tocsr()
+    anchors = (_anchors(bodies, starts, points, pair, towards) + diags(springs)).tocsr()
     return Thorax(mesh, _elastic(mesh, kinds), lung, walls, patch, rest, anchors, load)
 
 
@@ -279,18 +282,25 @@ def _walls(bodies: Sequence[TetMesh], starts: Array, lung: TetMesh, points: Arra
     return walls, patch
 
 
-def _anchors(bodies: Sequence[TetMesh], starts: Array, points: Array, caudal: float) -> csr_matrix:
+def _anchors(bodies: Sequence[TetMesh], starts: Array, points: Array, pair: Lung, towards: float) -> csr_matrix:
     """Springs that hold the chest, firmly at its back, and the far side of what is below."""
     held = np.zeros(len(points))
     chest, below = bodies
+    lung, side = pair.expired, pair.side
     size = BODY.young_kpa * np.cbrt(chest.node_volumes)
-    back = chest.points[:, 1] < np.quantile(chest.points[:, 1], 0.12)
-    held[starts[1] : starts[2]] = ANCHOR * size * np.where(back, 100.0, 0.1)
+    inward = chest.points[:, 0] * (1.0 if side == "left" else -1.0)
+    firm = (chest.points[:, 1] < np.quantile(chest.points[:, 1], 0.12)) | (inward > np.quantile(inward, 0.85))
+    held[starts[1] : starts[2]] = ANCHOR * size * np.where(firm, 30.0, 1.0)
     size = BODY.young_kpa * np.cbrt(below.node_volumes)
-    depth = caudal * below.points[:, 2]
+    depth = towards * below.points[:, 2]
     held[starts[2] : starts[3]] = ANCHOR * size * np.where(depth > np.quantile(depth, 0.7), 1.0, 0.1)
-    held[: starts[1]] = 1e-6
+    held[: starts[1]] = TETHER * LUNG.young_kpa * np.cbrt(lung.node_volumes) * _near_hilum(lung, side)
     return diags(np.repeat(held, 3)).tocsr()
+
+
+def _near_hilum(lung: TetMesh, side: Side) -> Array:
+    """How near (n,) the lung's nodes lie to where bronchi and vessels tether it, 1 at the hilum."""
+    return np.exp(-(((lung.points - hilum(lung, side)) / HILUM_MM) ** 2).sum(axis=1)) + 1e-6
 
 
 def _elastic(mesh: TetMesh, kinds: Array) -> csr_matrix:

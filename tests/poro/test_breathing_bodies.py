@@ -55,7 +55,10 @@ def ball_mask(margin: int = 6) -> tuple[Array, Array]:
 @pytest.fixture(scope="module")
 def chest() -> tuple[Thorax, Lung]:
     inside, affine = ball_mask()
-    lung = Lung("right", pear(20.0, np.array([1.04, 1.06, 1.05])), pear(20.0))
+    expired, stretch = pear(20.0), np.array([1.04, 1.06, 1.05])
+    fixed = np.array([expired.points[:, 0].min(), expired.points[:, 1].min(), 0.0])  # inner side and back stay
+    inspired = TetMesh(fixed + stretch * (expired.points - fixed), expired.tets)
+    lung = Lung("right", inspired, expired)
     return thorax(inside, affine, lung, WALL_ALONE), lung
 
 
