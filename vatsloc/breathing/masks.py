@@ -73,20 +73,14 @@ def to_the_back(expired: Mask, inspired: Mask) -> Mask:
     """Expired lung filled up to the back wall of the inspired one; voxels along the patient's axes.
 
     On a patient's back, spine and back ribs lie still; but what lies lowest may grow so dense in expiration that a
-    threshold leaves it out of the mask. Where even the nearest tenth of the back lies off, the wall itself has moved
-    by as much.
+    threshold leaves it out of the mask.
     """
     inspired = resample_mask(inspired, expired.grid)
     step = -1 if expired.ras_from_ijk[1, 1] < 0 else 1
     lung, full = expired.inside[:, ::step], inspired.inside[:, ::step]
-    both = lung.any(axis=1) & full.any(axis=1)
-    off = (lung.argmax(axis=1) - full.argmax(axis=1))[both]
-    moved = max(round(float(np.percentile(off, 10))), 0) if both.any() else 0
-    wall = np.zeros_like(full)
-    wall[:, moved:] = full[:, : full.shape[1] - moved]
-    # Running from back to front: behind the expired lung, and not behind the wall.
+    # Running from back to front: behind the expired lung, and not behind the inspired one.
     behind = ~np.logical_or.accumulate(lung, axis=1) & lung.any(axis=1, keepdims=True)
-    filled = lung | (behind & np.logical_or.accumulate(wall, axis=1))
+    filled = lung | (behind & np.logical_or.accumulate(full, axis=1))
     return Mask(filled[:, ::step], expired.ras_from_ijk)
 
 
