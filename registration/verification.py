@@ -93,20 +93,23 @@ def left_over(
         raise ValueError("the two images and both regions must lie on one grid")
     voxel = float(fixed.grid.spacing.mean())
     starts = blobs(fixed.hu, region.inside, settings.sigma_mm / voxel, max(round(settings.cell_mm / voxel), 1))
-    if not len(starts):
+    looked_for = len(starts)
+    if not looked_for:
         return LeftOver(np.zeros((0, 3)), np.zeros((0, 3)), 0)
     reach = round(settings.reach_mm / voxel)
-    needed = _about(starts, fixed.grid, 2 * reach + BLOCK_RADIUS)
-    here, there = describe(fixed.hu, needed), describe(moving.hu, needed)
+    here = describe(fixed.hu, _about(starts, fixed.grid, BLOCK_RADIUS))
+    there = describe(moving.hu, _about(starts, fixed.grid, reach + BLOCK_RADIUS))
     found = find_similar(here, there, allowed.inside, starts, reach)
-    ends = np.rint(starts + found.shift).astype(np.int64)
+    clear = found.is_inner & (found.cost < settings.most_ratio * found.runner_up)
+    starts, shift = starts[clear], found.shift[clear]
+    ends = np.rint(starts + shift).astype(np.int64)
+    here = describe(fixed.hu, _about(ends, fixed.grid, reach + BLOCK_RADIUS))
     back = find_similar(there, here, np.ones(fixed.hu.shape, bool), ends, reach)
-    trip = np.linalg.norm(found.shift + back.shift, axis=1) * voxel
-    kept = found.is_inner & (found.cost < settings.most_ratio * found.runner_up) & (trip <= settings.round_trip_mm)
+    kept = np.linalg.norm(shift + back.shift, axis=1) * voxel <= settings.round_trip_mm
     points = fixed.grid.to_ras(starts[kept].astype(float))
-    vectors = found.shift[kept] @ fixed.grid.ras_from_ijk[:3, :3].T
+    vectors = shift[kept] @ fixed.grid.ras_from_ijk[:3, :3].T
     agree = moves_with_neighbours(points, vectors, settings.neighbours, settings.stray_mm)
-    return LeftOver(points[agree], vectors[agree], len(starts))
+    return LeftOver(points[agree], vectors[agree], looked_for)
 
 
 def rigid_between(first: Array, second: Array) -> RigidTransform:

@@ -7,8 +7,11 @@ from pathlib import Path
 
 import pytest
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command line does, before numpy is imported
+for threads in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
+    os.environ.setdefault(threads, "1")  # before numpy is imported; two workers share two cores
 
+LONGEST = ("vatsloc/test_localize.py", "phantoms/test_case.py", "registration/test_ffd.py")
+"""Test files that take longest, first in turn: else one process might be left with one of them at the end."""
 SHARED = Path(os.environ.get("VATSLOC_SHARED", Path(__file__).resolve().parents[2] / "shared"))
 
 
@@ -18,3 +21,9 @@ def shared() -> Path:
     if not (SHARED / "cases").is_dir():
         pytest.skip("the shared cases are not here")
     return SHARED
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The longest files first, all others in the order they were found."""
+    turn = {name: n for n, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: turn.get("/".join(item.path.parts[-2:]), len(turn)))

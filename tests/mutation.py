@@ -1,6 +1,6 @@
 """Do the tests notice? Puts single faults into the code that decides correctness and counts those that a test kills.
 
-    python tests/mutation.py --number 200 --seed 0 --out DIR [--only GLOB] [--jobs 1] [--end-to-end]
+    python tests/mutation.py --number 200 --seed 0 --out DIR [--only GLOB] [--within GLOB] [--jobs 1] [--end-to-end]
 
 Our own, since mutmut leaves out decorated functions (every numba kernel) and cosmic-ray has one test command for all
 modules, works in the checkout and draws no sample; neither knows which compiled kernels a change makes stale.
@@ -31,18 +31,38 @@ from tests.faults.mutants import Mutant, mutants, sibling_fields
 from tests.faults.table import Name, Record, name_of, table
 
 ROOT = Path(__file__).resolve().parents[1]
+
+
+def named(folder: str, words: str) -> tuple[str, ...]:
+    """Test files of a folder by the rest of their names."""
+    return tuple(f"tests/{folder}/test_{word}.py" for word in words.split())
+
+
 # Modules that decide correctness: the test files that judge them, () for those that import them, None for none.
 Scope = Mapping[str, tuple[str, ...] | None]
+# Rooms whose own tests are slower than others that import them too, or reach them over a front door, name theirs.
 SCOPE: Scope = {
     "registration/**/*.py": (),
     "poro/**/*.py": (),
-    "vatsloc/case.py": (),
+    "poro/contact/*.py": named("poro", "contact hertz"),
+    "poro/mesh/*.py": (*named("poro", "mesh mesh_masks contact fit"), *named("vatsloc", "shuffled_nodes breathing")),
+    "vatsloc/case.py": named("vatsloc", "case case_refused marks new_case greyvalues dicom_regions"),
     "vatsloc/frames.py": (),
     "vatsloc/maps.py": (),
     "vatsloc/results.py": (),
     "vatsloc/evaluation/**/*.py": (),
-    "vatsloc/formats/**/*.py": (),
-    "vatsloc/imaging/**/*.py": (),
+    "vatsloc/formats/**/*.py": named(
+        "vatsloc",
+        "formats_images formats_images_refused formats_fields formats_folder formats_markups formats_meshes "
+        "formats_transforms malformed_images malformed_marks case marks slicer_scene",
+    ),
+    "vatsloc/formats/dicom/*.py": named(
+        "vatsloc", "formats_dicom dicom_files dicom_series dicom_pixels dicom_regions dicom_malformed marks"
+    ),
+    "vatsloc/imaging/**/*.py": named(
+        "vatsloc",
+        "imaging_cbct imaging_lung_hint imaging_lungs imaging_pleura greyvalues surface_points hilum_motion new_case",
+    ),
     "vatsloc/workflow/**/*.py": (),
     "vatsloc/workflow/stages.py": None,  # seconds, memory and messages
 }
@@ -166,7 +186,8 @@ def main(words: Sequence[str] | None = None, root: Path = ROOT, scope: Scope = S
     parser.add_argument("--number", type=int, default=200, help="mutants to draw")
     parser.add_argument("--seed", type=int, default=0, help="of the draw; a larger number adds to a smaller")
     parser.add_argument("--out", type=Path, required=True, help="folder of mutants.jsonl and table.md, taken up again")
-    parser.add_argument("--only", default="*", help="glob of the modules' paths")
+    parser.add_argument("--only", default="*", help="glob of the modules' paths to draw from")
+    parser.add_argument("--within", default="*", help="glob of the paths to judge now, of those drawn; others later")
     parser.add_argument("--jobs", type=int, default=1, help="mutants judged at a time, each in a copy of its own")
     parser.add_argument("--end-to-end", action="store_true", help="put survivors to the demo run too")
     parser.add_argument("--deselect", action="append", default=[], help="test that fails here without a fault too")
@@ -178,7 +199,8 @@ def main(words: Sequence[str] | None = None, root: Path = ROOT, scope: Scope = S
     files = sorted(file for file, tests in judges.items() if tests is not None and fnmatch(file, asked.only))
     siblings = sibling_fields(imports.trees[file] for file in files)
     found = [mutant for file in files for mutant in mutants(file, (root / file).read_text("utf-8"), siblings)]
-    records = verdicts(drawn(found, asked.number, asked.seed), judges, imports, asked)
+    sample = [mutant for mutant in drawn(found, asked.number, asked.seed) if fnmatch(mutant.file, asked.within)]
+    records = verdicts(sample, judges, imports, asked)
     reasons = root / JUDGED
     entries = tomllib.loads(reasons.read_text("utf-8"))["judged"] if reasons.exists() else []
     text = table(records, entries, asked.seed)

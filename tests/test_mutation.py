@@ -227,6 +227,7 @@ def test_verdicts_are_right_and_are_taken_up_again(tree: Path, tmp_path: Path) -
         mutation.main(command, tree, {"ages.py": (), "tests/*.py": None})
         return [json.loads(line) for line in (out / "mutants.jsonl").read_text().splitlines()]
 
+    assert run("--number", "1", "--within", "elsewhere/*") == []
     (first,) = run("--number", "1")
     assert (first["operator"], first["after"], first["verdict"]) == ("comparison", ">", "survived")
     again, second, first_by_demo = run("--number", "2", "--end-to-end", "--jobs", "2")

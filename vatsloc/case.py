@@ -1,4 +1,4 @@
-"""A case in memory: three images, the nodule, the side and the setup, checked as far as headers and voxels allow.
+"""A case in memory: its images, the nodule, the side and the setup, checked as far as headers and voxels allow.
 
 All images leave this module with voxel axes in one order (LPS, as axial DICOM slices are stored), so that later stages
 need no thought about storage; `Case.stored_axes` remembers the order of the files, for writing results on their grids.
@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -47,19 +48,18 @@ class Hints:
 
 
 @dataclass(frozen=True)
-class Case:
-    """Everything `localize` may know.
+class CaseBefore:
+    """What is known of a case before its lung is collapsed.
 
-    side: of the operated lung; gravity_ras: unit (3,) in the CBCT's frame; input_sha256 and stored_axes: by name of the
-    input; warnings: sentences for the report; calibration: what made images HU, by name of those that were not;
-    side_told_by: "case.toml", "nodule" or "pleural gas".
+    side: of the operated lung; cbct_inflated: None where it was not taken (yet); gravity_ras: unit (3,) in the CBCT's
+    frame; input_sha256 and stored_axes: by name of the input; warnings: sentences for the report; calibration: what
+    made images HU, by name of those that were not; side_told_by: "case.toml", "nodule" or "pleural gas".
     """
 
     folder: Path
     side: Side
     ct: Volume
-    cbct_inflated: Volume
-    cbct_deflated: Volume
+    cbct_inflated: Volume | None
     nodule: Nodule
     gravity_ras: Array
     pleural_gas: PleuralGas
@@ -69,6 +69,14 @@ class Case:
     warnings: tuple[str, ...] = ()
     calibration: Mapping[str, Calibration] = field(default_factory=dict)
     side_told_by: str = FILE_NAME
+
+
+@dataclass(frozen=True, kw_only=True)
+class Case(CaseBefore):
+    """Everything `localize` may know."""
+
+    cbct_inflated: Volume
+    cbct_deflated: Volume
 
 
 @dataclass(frozen=True)
@@ -87,42 +95,95 @@ def read_case(folder: Path) -> Case:
 
     Raises CaseError for a wrong case file, InputRefused for inputs that cannot be trusted or do not belong together.
     """
+    read = _read(folder, read_case_file(folder), ("ct", "cbct_inflated", "cbct_deflated"))
+    images = read.images
+    side, told_by = read.side or told_side(images["ct"], images["cbct_inflated"], images["cbct_deflated"], read.nodule)
+    known = _known(read, side, told_by)
+    return Case(**{**known, "cbct_inflated": images["cbct_inflated"], "cbct_deflated": images["cbct_deflated"]})
+
+
+def read_case_before(folder: Path) -> CaseBefore:
+    """What there is of a case before the lung is collapsed: the CT, and the inflated scan once its file is there.
+
+    Raises as `read_case`, and InputRefused where neither case.toml nor the nodule tells the side.
+    """
     file = read_case_file(folder)
-    paths = _input_paths(folder, file)
+    inflated = file.images.cbct_inflated
+    taken = ("ct",) if inflated is None or not (folder / inflated).exists() else ("ct", "cbct_inflated")
+    read = _read(folder, file, taken)
+    side = nodule_side(read.images["ct"], read.nodule.mask, read.nodule.centre_ras)
+    told = read.side or (None if side is None else (side, "nodule"))
+    if told is None:
+        raise InputRefused(
+            "The nodule's place in the CT does not tell the operated side, and no deflated CBCT is there to tell it; "
+            'add side = "right" or side = "left" to case.toml.'
+        )
+    return CaseBefore(**{**_known(read, *told), "cbct_inflated": read.images.get("cbct_inflated")})
+
+
+@dataclass(frozen=True)
+class _Read:
+    """Images of a folder by name, in HU, and what belongs to them. side: as case.toml states it, and that it does."""
+
+    folder: Path
+    file: CaseFile
+    images: dict[str, Volume]
+    axes: dict[str, str]
+    nodule: Nodule
+    side: tuple[Side, str] | None
+    hints: Hints
+    sha256: dict[str, str]
+    warnings: list[str]
+    calibration: dict[str, Calibration]
+
+
+def _read(folder: Path, file: CaseFile, taken: tuple[str, ...]) -> _Read:
+    """Read and check the images `taken`, and the nodule."""
+    paths = _input_paths(folder, file, taken)
     with ThreadPoolExecutor(max_workers=2) as pool:  # decompression and hashing release the interpreter lock
-        names = ("ct", "cbct_inflated", "cbct_deflated")
-        images = pool.map(lambda name: _read_image(paths[name], file.images.series(name)), names)
+        found = pool.map(lambda name: _read_image(paths[name], file.images.series(name)), taken)
         digests = pool.map(sha256, paths.values())
-        (ct, ct_axes, said), (inflated, inflated_axes, said_inflated), (deflated, deflated_axes, said_deflated) = images
+        volumes, axes, said = zip(*found, strict=True)
         input_sha256 = dict(zip(paths, digests, strict=True))
-    for name in ("cbct_inflated", "cbct_deflated"):
-        _check_overlap(ct.grid, (inflated if name == "cbct_inflated" else deflated).grid, paths["ct"], paths[name])
-    _check_overlap(inflated.grid, deflated.grid, paths["cbct_inflated"], paths["cbct_deflated"])
-    warnings = [*said, *said_inflated, *said_deflated]
-    hu, calibration = in_hounsfield(
-        {"ct": ct, "cbct_inflated": inflated, "cbct_deflated": deflated}, paths, stated_maps(file.images), warnings
-    )
-    ct, inflated, deflated = hu.values()
+    grids = {name: volume.grid for name, volume in zip(taken, volumes, strict=True)}
+    for number, a in enumerate(taken):
+        for b in taken[number + 1 :]:
+            _check_overlap(grids[a], grids[b], paths[a], paths[b])
+    warnings = [sentence for sentences in said for sentence in sentences]
+    named = dict(zip(taken, volumes, strict=True))
+    images, calibration = in_hounsfield(named, paths, stated_maps(file.images), warnings)
     frame = _frame_of_ct(paths, file)
     source = NoduleSource(paths.get("nodule_mask"), file.nodule.label, paths.get("nodule_point"), frame)
-    nodule = read_nodule(source, ct.grid, warnings)
-    side, side_told_by = (file.side, FILE_NAME) if file.side else told_side(ct, inflated, deflated, nodule)
-    return Case(
+    return _Read(
         folder=folder,
-        side=side,
-        ct=ct,
-        cbct_inflated=inflated,
-        cbct_deflated=deflated,
-        nodule=nodule,
-        gravity_ras=_gravity(side, file.setup.gravity_cbct),
-        pleural_gas=file.setup.pleural_gas,
-        hints=_hints(file, paths, (ct.grid, inflated.grid, deflated.grid), frame, warnings),
-        input_sha256=input_sha256,
-        stored_axes={"ct": ct_axes, "cbct_inflated": inflated_axes, "cbct_deflated": deflated_axes},
-        warnings=tuple(warnings),
+        file=file,
+        images=images,
+        axes=dict(zip(taken, axes, strict=True)),
+        nodule=read_nodule(source, grids["ct"], warnings),
+        side=(file.side, FILE_NAME) if file.side else None,
+        hints=_hints(file, paths, grids, frame, warnings),
+        sha256=input_sha256,
+        warnings=warnings,
         calibration=calibration,
-        side_told_by=side_told_by,
     )
+
+
+def _known(read: _Read, side: Side, told_by: str) -> dict[str, Any]:
+    """Fields that every case has."""
+    return {
+        "folder": read.folder,
+        "side": side,
+        "ct": read.images["ct"],
+        "nodule": read.nodule,
+        "gravity_ras": _gravity(side, read.file.setup.gravity_cbct),
+        "pleural_gas": read.file.setup.pleural_gas,
+        "hints": read.hints,
+        "input_sha256": read.sha256,
+        "stored_axes": read.axes,
+        "warnings": tuple(read.warnings),
+        "calibration": read.calibration,
+        "side_told_by": told_by,
+    }
 
 
 def told_side(ct: Volume, inflated: Volume, deflated: Volume, nodule: Nodule) -> tuple[Side, str]:
@@ -168,15 +229,17 @@ def sha256(path: Path) -> str:
     return digests[0] if len(digests) == 1 else hashlib.sha256("".join(digests).encode()).hexdigest()
 
 
-def _input_paths(folder: Path, file: CaseFile) -> dict[str, Path]:
-    names = {
-        "ct": file.images.ct,
-        "cbct_inflated": file.images.cbct_inflated,
-        "cbct_deflated": file.images.cbct_deflated,
+def _input_paths(folder: Path, file: CaseFile, taken: tuple[str, ...]) -> dict[str, Path]:
+    """Files of the images `taken` and of what goes with them, by name."""
+    names = {name: getattr(file.images, name) for name in taken}
+    for name in taken:
+        if names[name] is None:
+            raise CaseError(f"{folder / FILE_NAME}: [images] {name} is missing; add it.")
+    names |= {
         "nodule_mask": file.nodule.mask,
         "nodule_point": file.nodule.point,
         "lung_mask_ct": file.hints.lung_mask_ct,
-        "deflated_surface": file.hints.deflated_surface,
+        "deflated_surface": file.hints.deflated_surface if "cbct_deflated" in taken else None,
     }
     paths = {key: folder / name for key, name in names.items() if name is not None}
     for key, path in paths.items():
@@ -244,15 +307,14 @@ def _share_inside(a: Grid, b: Grid) -> float:
 
 
 def _hints(
-    file: CaseFile, paths: Mapping[str, Path], grids: tuple[Grid, Grid, Grid], frame: str, warnings: list[str]
+    file: CaseFile, paths: Mapping[str, Path], grids: Mapping[str, Grid], frame: str, warnings: list[str]
 ) -> Hints:
-    ct, inflated, deflated = grids
     spines: list[Array | None] = []
-    for key, point, grid in (
-        ("spine_ct", file.hints.spine_ct, ct),
-        ("spine_cbct_inflated", file.hints.spine_cbct_inflated, inflated),
+    for key, point, image in (
+        ("spine_ct", file.hints.spine_ct, "ct"),
+        ("spine_cbct_inflated", file.hints.spine_cbct_inflated, "cbct_inflated"),
     ):
-        if point is not None and not inside_of(grid, np.array(point)):
+        if point is not None and image in grids and not inside_of(grids[image], np.array(point)):
             raise CaseError(
                 f"{key} = {list(point)} in case.toml lies outside its image; give RAS millimetres inside it."
             )
@@ -260,9 +322,9 @@ def _hints(
     lung = surface = None
     if "lung_mask_ct" in paths:
         ask = "[hints] lung_label = ... in case.toml"
-        lung = mask_on(paths["lung_mask_ct"], ct, file.hints.lung_label, ask, warnings, frame)
+        lung = mask_on(paths["lung_mask_ct"], grids["ct"], file.hints.lung_label, ask, warnings, frame)
     if "deflated_surface" in paths:
-        surface = read_hint_surface(paths["deflated_surface"], deflated, warnings)
+        surface = read_hint_surface(paths["deflated_surface"], grids["cbct_deflated"], warnings)
     return Hints(spines[0], spines[1], lung, surface)
 
 

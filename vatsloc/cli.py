@@ -5,7 +5,10 @@ from __future__ import annotations
 import os
 import sys
 import traceback
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from threading import Event
 from typing import Annotated, Literal
 
 import typer
@@ -33,6 +36,12 @@ DEBUG = "--debug"
 CaseArgument = Annotated[Path, typer.Argument(metavar="CASE", help="Case folder with case.toml.")]
 
 
+LinkOption = Annotated[
+    int | None,
+    typer.Option(metavar="PORT", min=1, max=65535, help='Serve the answer by OpenIGTLink (extra "navigation").'),
+]
+
+
 @app.callback()
 def _whole_program(
     debug: Annotated[bool, typer.Option(DEBUG, help="Show the traceback of what ends a command early.")] = False,
@@ -46,21 +55,46 @@ def localize(
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Results folder, written whole or not at all.")],
     preset: Annotated[str, typer.Option(metavar="NAME", help="fast, balanced, accurate or auto.")] = "balanced",
     settings: Annotated[Path | None, typer.Option(metavar="FILE", help="TOML file that overrides the preset.")] = None,
+    state: Annotated[Path | None, typer.Option(metavar="STATE", help="What `vatsloc prepare` made of CASE.")] = None,
+    openigtlink: LinkOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Find the nodule of CASE in the deflated cone-beam CT."""
     from vatsloc.workflow.run import run_case
     from vatsloc.workflow.settings import load_settings
 
-    run = run_case(case, out, load_settings(preset, settings), say)
-    if as_json:
-        show(run)
-    else:
-        x, y, z = run["nodule_lps"]
-        print(f"nodule at LPS {x:.1f} {y:.1f} {z:.1f} mm in the deflated CBCT; report: {out / 'report.html'}")
+    with _link(openigtlink) as publish:
+        run = run_case(case, out, load_settings(preset, settings), say, state)
+        if as_json:
+            show(run)
+        else:
+            x, y, z = run["nodule_lps"]
+            print(f"nodule at LPS {x:.1f} {y:.1f} {z:.1f} mm in the deflated CBCT; report: {out / 'report.html'}")
+        if openigtlink is not None:
+            publish(out, "")
+            _until_interrupted(f"OpenIGTLink serves the answer on port {openigtlink}; Ctrl-C ends it")
     failed = [gate["says"] for gate in run["gates"].values() if not gate["ok"]]
     if failed:
         raise GateFailed(f"The result is written to {out}, but do not trust it: {' '.join(failed)}")
+
+
+@app.command()
+def prepare(
+    case: CaseArgument,
+    out: Annotated[Path, typer.Option("--out", metavar="STATE", help="Folder for `localize --state` to go on from.")],
+    preset: Annotated[str, typer.Option(metavar="NAME", help="fast, balanced, accurate or auto.")] = "balanced",
+    settings: Annotated[Path | None, typer.Option(metavar="FILE", help="TOML file that overrides the preset.")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Do all that needs no deflated scan: after the CT alone, and again once the inflated scan is there."""
+    from vatsloc.workflow.settings import load_settings
+    from vatsloc.workflow.state import prepare_case
+
+    told = prepare_case(case, out, load_settings(preset, settings), say)
+    if as_json:
+        show(told)
+    else:
+        print(f"{out} holds what {' and '.join(told['scans'])} tell; go on by vatsloc localize CASE --state {out}")
 
 
 @app.command()
@@ -122,6 +156,61 @@ def breathe(
         show(result)
     else:
         print(out / "breath.html")
+
+
+@app.command()
+def export_dicom(
+    result: Annotated[Path, typer.Argument(metavar="RESULT", help="Results folder of localize.")],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the DICOM files.")],
+    series: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="DICOM series of the deflated scan, where the case has it elsewhere."),
+    ] = None,
+) -> None:
+    """Write nodule, ellipsoid and lung as DICOM Segmentation, and a measurement report (extra "dicom")."""
+    from vatsloc.dicomout import export_result
+
+    for file in export_result(result, out, series):
+        print(file)
+
+
+@app.command()
+def listen(
+    port: Annotated[int, typer.Option(metavar="N", min=0, max=65535, help="Port to listen on.")],
+    cases: Annotated[Path, typer.Option(metavar="DIR", help="Folder for what arrives and for the answers.")],
+    nodule: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE|DIR", help="Nodule in the CT, or a folder of files named by patient ID."),
+    ] = None,
+    ct: Annotated[Path | None, typer.Option("--ct", metavar="DIR", help="CT that is here already, as DICOM.")] = None,
+    patient: Annotated[str, typer.Option(metavar="ID", help="Patient whom the file of --nodule is about.")] = "",
+    send: Annotated[str | None, typer.Option(metavar="[TITLE@]HOST:PORT", help="Node that gets the answers.")] = None,
+    allow: Annotated[str, typer.Option(metavar="A,B,..", help="Titles of callers; all others are refused.")] = "",
+    title: Annotated[str, typer.Option(metavar="TITLE", help="Own application entity title.")] = "VATSLOC",
+    preset: Annotated[str, typer.Option(metavar="NAME", help="fast, balanced, accurate or auto.")] = "balanced",
+    settle: Annotated[float, typer.Option(metavar="S", min=0, help="Silence after which a series may be whole.")] = 5.0,
+    timeout: Annotated[float, typer.Option(metavar="S", min=1, help="Silence after which one is given up.")] = 120.0,
+    openigtlink: LinkOption = None,
+) -> None:
+    """Take scans that are pushed by DICOM, answer, and send the answer on (extra "dicom")."""
+    from vatsloc.dicomnet.arrival import Patience
+    from vatsloc.dicomnet.listen import Node, import_series, require_pynetdicom
+    from vatsloc.dicomnet.listen import listen as serve
+    from vatsloc.dicomnet.nodule import NoduleFiles
+    from vatsloc.dicomnet.sending import target_of
+    from vatsloc.dicomnet.work import real_work
+    from vatsloc.workflow.settings import load_settings
+
+    require_pynetdicom()
+    load_settings(preset, None)
+    target = None if send is None else target_of(send)
+    whose = import_series(cases, ct) if ct is not None else ""
+    nodules = None if nodule is None else NoduleFiles(nodule, patient or whose)
+    callers = tuple(word.strip() for word in allow.split(",") if word.strip())
+    with _link(openigtlink) as publish, suppress(KeyboardInterrupt):
+        node = Node(cases, port, title, callers, target, Patience(settle, timeout), publish)
+        serve(node, nodules, real_work(preset), say)
+    say("stopped; start it again to go on")
 
 
 @app.command()
@@ -211,6 +300,26 @@ def paper(
     require_matplotlib()
     write_paper(run_paper(find_cases(folders), out, jobs, say), out)
     print(out / "paper.md")
+
+
+@contextmanager
+def _link(port: int | None) -> Iterator[Callable[[Path, str], None]]:
+    """What publishes a result to navigation screens while the block runs; nothing where no port is given."""
+    if port is None:
+        yield lambda result, patient: None
+        return
+    from vatsloc.navigation import messages_of, serving
+    from vatsloc.navigation.messages import require_pyigtl
+
+    require_pyigtl()
+    with serving(port) as link:
+        yield lambda result, patient: link.publish(messages_of(result, patient))
+
+
+def _until_interrupted(sentence: str) -> None:
+    say(sentence)
+    with suppress(KeyboardInterrupt):
+        Event().wait()
 
 
 def main(arguments: list[str] | None = None) -> None:

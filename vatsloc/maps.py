@@ -8,6 +8,7 @@ import numpy as np
 from scipy import ndimage
 
 from poro.mesh import TetMesh, interpolate, locate
+from registration.keypoints.aligned_matching import Linearized
 from registration.maps.field import DisplacementField, sample_map
 from registration.maps.rigid import RigidTransform
 from registration.volume import Array, Grid, Mask
@@ -29,6 +30,16 @@ class MeshMap:
         """Moved points (q, 3) mm."""
         points = np.asarray(points_ras, dtype=float)
         return self.around(points) + interpolate(locate(self.mesh, points), self.relative)
+
+    def linearized(self, points_ras: Array) -> Linearized:
+        """Moved points and the map's gradient at points (q, 3) mm; outside the mesh the rigid motion's gradient."""
+        points = np.asarray(points_ras, dtype=float)
+        at = locate(self.mesh, points)
+        gradients = np.broadcast_to(self.around.matrix[:3, :3], (len(points), 3, 3)).copy()
+        inside, corners = at.inside, at.nodes[at.inside]
+        before, after = (x[corners[:, 1:]] - x[corners[:, :1]] for x in (self.mesh.points, self.moved))
+        gradients[inside] = np.linalg.solve(before, after).transpose(0, 2, 1)
+        return Linearized(self.around(points) + interpolate(at, self.relative), gradients)
 
     @property
     def relative(self) -> Array:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
+import os
 import platform
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -38,6 +41,8 @@ RIGID_CT_FROM_INFLATED = "from-CBCTinflated_to-CT_mode-image_desc-rigid_xfm.tfm"
 RIGID_DEFLATED_FROM_INFLATED = "from-CBCTinflated_to-CBCTdeflated_mode-points_desc-rigid_xfm.tfm"
 RIGID_INFLATED_FROM_DEFLATED = "from-CBCTdeflated_to-CBCTinflated_mode-image_desc-rigid_xfm.tfm"
 REPORT, SCENE, SCENE_WITH_SCANS = "report.html", "scene.mrml", "scene_with_scans.mrml"
+INPUTS = "inputs.json"
+"""Where the case lies, relative to the results folder, for what needs the scans again; run.json holds no path."""
 RADIUS95 = "radius95_mm"
 """Of the nodes of `LUNG_DEFLATED`: how far off the tissue there may be, 95 %."""
 
@@ -61,6 +66,7 @@ OUTPUT_FILES = (
     RIGID_DEFLATED_FROM_INFLATED,
     RIGID_INFLATED_FROM_DEFLATED,
     RUN_FILE,
+    INPUTS,
     REPORT,
     SCENE,
     SCENE_WITH_SCANS,
@@ -152,10 +158,36 @@ def read_run(folder: Path) -> dict[str, Any]:
     return run
 
 
+def write_inputs(partial: Path, case: Path, folder: Path) -> None:
+    """Note in a result that is filled as `partial` and will lie in `folder` where its case is."""
+    relative = os.path.relpath(case.resolve(), folder.resolve())
+    (partial / INPUTS).write_text(json.dumps({"case": relative}) + "\n", encoding="utf-8")
+
+
+def case_of(folder: Path) -> Path | None:
+    """The case folder that a result was made from, None where it does not say."""
+    try:
+        relative = json.loads((folder / INPUTS).read_text(encoding="utf-8"))["case"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return Path(os.path.normpath(folder.resolve() / str(relative)))
+
+
 def versions() -> dict[str, str]:
     """Versions of the program, of Python and of the packages that shape the numbers."""
     packages = (PROGRAM, "numpy", "scipy", "numba", "scikit-fem", "pyamg", "scikit-image")
     return {"python": platform.python_version(), **{name: metadata.version(name) for name in packages}}
+
+
+@cache
+def source_digest() -> str:
+    """Digest of the program's own source files: any change of it is another program."""
+    told = hashlib.blake2b(digest_size=16)
+    root = Path(__file__).parents[1]
+    for package in ("registration", "poro", "vatsloc"):
+        for file in sorted((root / package).rglob("*.py")):
+            told.update(file.relative_to(root).as_posix().encode() + file.read_bytes())
+    return told.hexdigest()
 
 
 def _write_small_files(folder: Path, data: ResultData) -> None:

@@ -68,4 +68,4 @@ def _images(case: Path) -> list[VolumeFile]:
         ("inflated CBCT", files.cbct_inflated, INFLATED),
         ("CT", files.ct, CT),
     )
-    return [VolumeFile(name, case / file, frame) for name, file, frame in named if (case / file).is_file()]
+    return [VolumeFile(name, case / file, frame) for name, file, frame in named if file and (case / file).is_file()]

@@ -1,4 +1,4 @@
-"""Constitutive models at finite strain, values that a solver is given. Both are linear elasticity at small strain."""
+"""Constitutive models at finite strain, values that a solver is given."""
 
 from __future__ import annotations
 
@@ -19,27 +19,6 @@ class ConstitutiveModel:
 
     name: str
     respond: Callable[[Array], tuple[Array, Array, Array]]
-
-
-def saint_venant_kirchhoff(tissue: Tissue) -> ConstitutiveModel:
-    """Linear in the Green-Lagrange strain; softens, and in the end buckles, below 58 % of its length."""
-    lame, mu = tissue.lame_kpa, tissue.shear_kpa
-    eye = np.eye(3)
-
-    def respond(f: Array) -> tuple[Array, Array, Array]:
-        e = (np.einsum("mki,mkj->mij", f, f) - eye) / 2
-        trace = np.einsum("mii->m", e)
-        s = lame * trace[:, None, None] * eye + 2 * mu * e
-        left = np.einsum("mik,mjk->mij", f, f)
-        moduli = (
-            np.einsum("ik,mlj->mijkl", eye, s)
-            + lame * np.einsum("mij,mkl->mijkl", f, f)
-            + mu * (np.einsum("mil,mkj->mijkl", f, f) + np.einsum("mik,jl->mijkl", left, eye))
-        )
-        energy = lame / 2 * trace**2 + mu * np.einsum("mij,mij->m", e, e)
-        return energy, f @ s, moduli
-
-    return ConstitutiveModel("Saint Venant-Kirchhoff", respond)
 
 
 def neo_hookean(tissue: Tissue) -> ConstitutiveModel:

@@ -6,7 +6,7 @@ places are, `identifiability` how well each parameter is held; `elastic_correcti
 
 from poro.fit.collapse_fit import Fit, FitStatus, fit_collapse
 from poro.fit.covariance import ellipsoid95, point_covariance
-from poro.fit.elastic_correction import constraints_to, elastic_correction
+from poro.fit.elastic_correction import PointConstraints, constraints_to, elastic_correction
 from poro.fit.identifiability import Identifiability, identifiability
 from poro.fit.observations import Target
 from poro.fit.problem import FitSettings
@@ -16,6 +16,7 @@ __all__ = [
     "FitSettings",
     "FitStatus",
     "Identifiability",
+    "PointConstraints",
     "Target",
     "constraints_to",
     "elastic_correction",

@@ -1,4 +1,4 @@
-"""Images seen through a map: resampling on another grid, smoothing and coarsening."""
+"""Images seen through a map: resampling on another grid, and coarsening."""
 
 from __future__ import annotations
 
@@ -22,11 +22,6 @@ def resample_mask(mask: Mask, grid: Grid, fixed_to_moving: PointMap | None = Non
     """`mask` on `grid`: inside where the trilinear membership is at least one half."""
     membership = _sampled(mask.inside.astype(np.float32), mask.grid, grid, fixed_to_moving, 0.0)
     return Mask(membership >= 0.5, grid.ras_from_ijk)
-
-
-def smooth(volume: Volume, sigma_mm: float) -> Volume:
-    """Gaussian smoothing with standard deviation `sigma_mm` along every axis, edges normalized."""
-    return _filtered(volume, volume.grid, np.full(3, sigma_mm))
 
 
 def coarsen(volume: Volume, spacing_mm: float) -> Volume:

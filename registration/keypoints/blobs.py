@@ -8,8 +8,11 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
+from registration.images.morphology import bounding_box
 from registration.volume import Array
 
+TRUNCATED = 4.0
+"""Standard deviations at which the smoothing is cut off."""
 LEAST_CURVATURE = 1.0
 """HU per voxel squared; weaker blobs are noise."""
 
@@ -21,26 +24,32 @@ def blobs(hu: Array, inside: Array, sigma: float, cell: int) -> Array:
     voxels. How strong a blob is tells the weakest of its three curvatures, so that a straight vessel, along which a
     block could slide, is none.
     """
-    at = np.argwhere(inside)
-    if not len(at):
-        return at
-    weakest = np.zeros(hu.shape, np.float32)
-    curvature = np.linalg.eigvalsh(_hessian(np.asarray(hu, np.float32), sigma)[inside])
+    if not inside.any():
+        return np.zeros((0, 3), int)
+    box = bounding_box(inside, np.full(3, int(TRUNCATED * sigma + 0.5) + 1))
+    inside = inside[box]
+    weakest = np.zeros(inside.shape, np.float32)
+    curvature = np.linalg.eigvalsh(_hessian(np.asarray(hu[box], np.float32), sigma, inside))
     weakest[inside] = np.maximum(np.maximum(-curvature[:, 2], curvature[:, 0]), 0)
     peaks = np.argwhere((weakest > LEAST_CURVATURE) & (weakest == ndimage.maximum_filter(weakest, 3)))
+    strength = weakest[tuple(peaks.T)]
+    peaks += [span.start for span in box]
     number = peaks // cell @ np.array([1, 1 << 20, 1 << 40])
-    order = np.argsort(-weakest[tuple(peaks.T)], kind="stable")
+    order = np.argsort(-strength, kind="stable")
     first = np.unique(number[order], return_index=True)[1]
     return peaks[np.sort(order[first])]
 
 
-def _hessian(hu: Array, sigma: float) -> Array:
-    """Second derivatives (ni, nj, nk, 3, 3) of an image smoothed by `sigma` voxels, per voxel squared."""
-    hessian = np.empty((*hu.shape, 3, 3), np.float32)
+def _hessian(hu: Array, sigma: float, inside: Array) -> Array:
+    """Second derivatives (n, 3, 3), per voxel squared, at the n voxels inside a region of an image smoothed by `sigma`
+    voxels.
+    """
+    hessian = np.empty((int(inside.sum()), 3, 3), np.float32)
     for a in range(3):
         for b in range(a, 3):
             order = [0, 0, 0]
             order[a] += 1
             order[b] += 1
-            hessian[..., a, b] = hessian[..., b, a] = ndimage.gaussian_filter(hu, sigma, order=order)
+            smooth = ndimage.gaussian_filter(hu, sigma, order=order, truncate=TRUNCATED)
+            hessian[:, a, b] = hessian[:, b, a] = smooth[inside]
     return hessian

@@ -137,6 +137,15 @@ def detect_keypoints(image: Volume, allowed: Array, settings: MatchSettings) -> 
     return ijk[np.sort(order[best])]
 
 
+def detect_inside(image: Volume, inside: Array, settings: MatchSettings) -> Array:
+    """As `detect_keypoints`, but the region's border is no edge: what lies outside takes the value of the nearest voxel
+    inside.
+    """
+    nearest = ndimage.distance_transform_edt(~inside, return_distances=False, return_indices=True)
+    filled = smoothed(Volume(image.hu[tuple(nearest)], image.ras_from_ijk))
+    return detect_keypoints(filled, inside, settings)
+
+
 def _match_blocks(fixed: Volume, moving: Volume, starts: Array, search: _Search) -> tuple[Array, Array]:
     """Voxels (n, 3), between voxels by a quadric, whose blocks look most like those at `starts`, and their NCC."""
     n = len(starts)

@@ -10,13 +10,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from registration.correspondences import Correspondences
 from registration.images.resample import resample, resample_mask
 from registration.keypoints.affine_matching import MaskedImage, match_affine_blocks
-from registration.keypoints.matching import MatchSettings, detect_keypoints, smoothed
+from registration.keypoints.matching import MatchSettings, detect_inside, smoothed
 from registration.volume import Array, Grid, Mask, Volume
 
 ROUNDS = 12
@@ -72,7 +71,7 @@ def propagate_matches(
     matches = seeds
     if len(matches) <= settings.neighbours or not inside.any():
         return matches
-    starts = detect_keypoints(_filled(here, inside), inside, match)
+    starts = detect_inside(here, inside, match)
     keypoints = grid.to_ras(starts.astype(float))
     is_open = cKDTree(matches.fixed).query(keypoints)[0] > SAME_MM
     tried = np.zeros(0, np.int64)
@@ -169,9 +168,3 @@ def _best_of_each(keypoint: Array, score: Array) -> Array:
     order = np.argsort(-score, kind="stable")
     best = order[np.unique(keypoint[order], return_index=True)[1]]
     return np.asarray(best[score[best] > 0])
-
-
-def _filled(image: Volume, inside: Array) -> Volume:
-    """What lies outside takes the value of the nearest voxel inside, so that the border is no edge."""
-    nearest = ndimage.distance_transform_edt(~inside, return_distances=False, return_indices=True)
-    return smoothed(Volume(image.hu[tuple(nearest)], image.ras_from_ijk))

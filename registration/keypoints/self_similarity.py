@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit, prange
@@ -33,6 +34,8 @@ _SIX = np.array([(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0,
 _PAIRS = np.array([(a, b) for a, b in combinations(range(6), 2) if not np.array_equal(_SIX[a], -_SIX[b])])
 _STEPS = np.arange(-BLOCK_RADIUS, BLOCK_RADIUS + 1, 2)
 _BLOCK = np.array([(a, b, c) for a in _STEPS for b in _STEPS for c in _STEPS if a * a + b * b + c * c <= 20])
+_LIMITS = np.log(np.arange(1, LEVELS) / LEVELS)
+"""Of minus a difference over the mean one: exp of it, times `LEVELS`, is 1, 2, ... there."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +50,19 @@ class Similar:
     cost: Array
     runner_up: Array
     is_inner: Array
+
+
+class _Pair(NamedTuple):
+    """What `_search` compares. fixed, moving: descriptions of two images, flat (n,); shape: (3,) of both; allowed:
+    voxels of the moving one that count; block: (m, 3) voxels about a middle one; offsets: (m,) the same, flat.
+    """
+
+    fixed: Array
+    moving: Array
+    shape: Array
+    allowed: Array
+    block: Array
+    offsets: Array
 
 
 def describe(hu: Array, needed: Array) -> Array:
@@ -68,8 +84,11 @@ def find_similar(fixed: Array, moving: Array, allowed: Array, starts: Array, rea
     n = len(starts)
     best, shift = np.full((n, 2), NO_COST, np.float32), np.zeros((n, 3), np.int64)
     around = np.full((n, 27), NO_COST, np.float32)
-    starts = np.ascontiguousarray(starts, np.int64)
-    _search(fixed, moving, np.ascontiguousarray(allowed), starts, _BLOCK, reach, best, shift, around)
+    _, nj, nk = fixed.shape
+    offsets = (_BLOCK @ np.array([nj * nk, nk, 1])).astype(np.uint64)  # of unsigned indices numba asks no sign
+    here, there = (np.ascontiguousarray(codes).ravel() for codes in (fixed, moving))
+    pair = _Pair(here, there, np.array(fixed.shape), np.ascontiguousarray(allowed), _BLOCK, offsets)
+    _search(pair, np.ascontiguousarray(starts, np.int64), reach, best, shift, around)
     offset, is_top = subvoxel_peak(-around / NO_COST)
     return Similar(shift + offset, best[:, 0], best[:, 1], is_top)
 
@@ -84,64 +103,103 @@ def _popcount(bits):
 
 
 @njit(cache=True)
-def _difference(hu, i, j, k, one, other):
-    """Sum of squared differences of the 27 voxels about two neighbours of voxel (i, j, k)."""
-    total = np.float32(0)
+def _differences(hu, i, j, start, stop, one, other, out):
+    """Sums of squared differences of the 27 voxels about two neighbours, of voxels (i, j, start) to (i, j, stop)."""
+    n = stop - start
+    out[:n] = 0
     for a in range(-1, 2):
         for b in range(-1, 2):
+            here, there = hu[i + a + one[0], j + b + one[1]], hu[i + a + other[0], j + b + other[1]]
             for c in range(-1, 2):
-                p = hu[i + a + one[0], j + b + one[1], k + c + one[2]]
-                total += (p - hu[i + a + other[0], j + b + other[1], k + c + other[2]]) ** 2
-    return total
+                p = here[start + c + one[2] : stop + c + one[2]]
+                q = there[start + c + other[2] : stop + c + other[2]]
+                for k in range(n):
+                    out[k] += (p[k] - q[k]) ** 2
 
 
 @njit(cache=True, parallel=True)
 def _describe(padded, needed, first, second, out):
     for i in prange(out.shape[0]):
-        apart = np.empty(len(first), np.float32)
+        apart, own = np.empty((len(first), out.shape[2]), np.float32), np.empty(len(first), np.float32)
         for j in range(out.shape[1]):
-            for k in range(out.shape[2]):
-                if not needed[i, j, k]:
-                    continue
-                for m in range(len(first)):
-                    apart[m] = _difference(padded, i + RIM, j + RIM, k + RIM, first[m], second[m])
-                apart -= apart.min()
-                spread = max(apart.mean(), np.float32(1e-3))
+            asked = np.flatnonzero(needed[i, j])
+            if len(asked) == 0:
+                continue
+            start, stop = asked[0], asked[-1] + 1
+            for m in range(len(first)):
+                _differences(padded, i + RIM, j + RIM, start + RIM, stop + RIM, first[m], second[m], apart[m])
+            for k in asked:
+                own[:] = apart[:, k - start]
+                own -= own.min()
+                spread = max(own.mean(), np.float32(1e-3))
                 bits = np.uint64(0)
                 for m in range(len(first)):
-                    level = min(int(np.exp(-apart[m] / spread) * LEVELS), LEVELS - 1)
+                    closeness, level = -own[m] / spread, 0
+                    for n in range(LEVELS - 1):
+                        level += closeness >= _LIMITS[n]
                     bits |= ((np.uint64(1) << np.uint64(level)) - np.uint64(1)) << np.uint64((LEVELS - 1) * m)
                 out[i, j, k] = bits
 
 
 @njit(cache=True)
-def _cost(fixed, moving, block, start, at):
-    """Mean Hamming distance of two blocks over the voxels that lie in both images."""
-    total, n = 0, 0
-    for m in range(len(block)):
-        p, q, r = start[0] + block[m, 0], start[1] + block[m, 1], start[2] + block[m, 2]
-        x, y, z = at[0] + block[m, 0], at[1] + block[m, 1], at[2] + block[m, 2]
-        if min(p, q, r, x, y, z) < 0 or max(p, x) >= fixed.shape[0]:
-            continue
-        if max(q, y) >= fixed.shape[1] or max(r, z) >= fixed.shape[2]:
-            continue
-        total += _popcount(fixed[p, q, r] ^ moving[x, y, z])
-        n += 1
-    return np.float32(total / n) if 2 * n >= len(block) else NO_COST
+def _holds_block(shape, at):
+    """Whether the whole block about a voxel lies in an image."""
+    inside = True
+    for m in range(3):
+        inside &= BLOCK_RADIUS <= at[m] < shape[m] - BLOCK_RADIUS
+    return inside
 
 
 @njit(cache=True)
-def _fill(cost, fixed, moving, allowed, block, start, middle, half, step):
-    """Costs of every `step`-th shift up to `half` about the shift at `middle` (3,) of an array of costs."""
+def _number(shape, at):
+    """Flat number of a voxel."""
+    return np.uint64((at[0] * shape[1] + at[1]) * shape[2] + at[2])
+
+
+@njit(cache=True)
+def _whole_cost(pair, own, at):
+    """Mean Hamming distance of a block's descriptions (m,) and those about a voxel, all of them in the image."""
+    total, middle = 0, _number(pair.shape, at)
+    for m in range(len(own)):
+        total += _popcount(own[m] ^ pair.moving[middle + pair.offsets[m]])
+    return np.float32(total / len(own))
+
+
+@njit(cache=True)
+def _cut_cost(pair, start, at):
+    """Mean Hamming distance of two blocks over the voxels that lie in both images."""
+    total, n, here, there = 0, 0, _number(pair.shape, start), _number(pair.shape, at)
+    for m in range(len(pair.block)):
+        inside = True
+        for axis in range(3):
+            p, x = start[axis] + pair.block[m, axis], at[axis] + pair.block[m, axis]
+            inside &= min(p, x) >= 0 and max(p, x) < pair.shape[axis]
+        if inside:
+            total += _popcount(pair.fixed[here + pair.offsets[m]] ^ pair.moving[there + pair.offsets[m]])
+            n += 1
+    return np.float32(total / n) if 2 * n >= len(pair.block) else NO_COST
+
+
+@njit(cache=True)
+def _fill(cost, pair, start, own, window):
+    """Costs, where not known yet, of every `step`-th shift up to `half` about the one at `middle` (3,).
+
+    cost: (w, w, w) of all shifts; own: the block's descriptions, none where it is cut; window: middle, half, step.
+    """
+    middle, half, step = window
     reach, at = cost.shape[0] // 2, np.empty(3, np.int64)
     for a in range(max(middle[0] - half, 0), min(middle[0] + half + 1, cost.shape[0]), step):
         for b in range(max(middle[1] - half, 0), min(middle[1] + half + 1, cost.shape[1]), step):
             for c in range(max(middle[2] - half, 0), min(middle[2] + half + 1, cost.shape[2]), step):
                 at[0], at[1], at[2] = start[0] + a - reach, start[1] + b - reach, start[2] + c - reach
-                if at.min() < 0 or at[0] >= moving.shape[0] or at[1] >= moving.shape[1] or at[2] >= moving.shape[2]:
+                if at.min() < 0 or at[0] >= pair.shape[0] or at[1] >= pair.shape[1] or at[2] >= pair.shape[2]:
                     continue
-                if allowed[at[0], at[1], at[2]]:
-                    cost[a, b, c] = _cost(fixed, moving, block, start, at)
+                if cost[a, b, c] != NO_COST or not pair.allowed[at[0], at[1], at[2]]:
+                    continue
+                if len(own) and _holds_block(pair.shape, at):
+                    cost[a, b, c] = _whole_cost(pair, own, at)
+                else:
+                    cost[a, b, c] = _cut_cost(pair, start, at)
 
 
 @njit(cache=True)
@@ -151,16 +209,19 @@ def _top(cost):
 
 
 @njit(cache=True, parallel=True)
-def _search(fixed, moving, allowed, starts, block, reach, best, shift, around):
+def _search(pair, starts, reach, best, shift, around):
     """Fill costs (n, 2) of the best and the next best shift (n, 3), and the costs (n, 27) about the best.
 
     Every other shift is compared, and all about the best of these.
     """
     width = 2 * reach + 1
     for n in prange(starts.shape[0]):
-        cost, middle = np.full((width, width, width), NO_COST), np.full(3, reach)
-        _fill(cost, fixed, moving, allowed, block, starts[n], middle, reach, 2)
-        _fill(cost, fixed, moving, allowed, block, starts[n], _top(cost), 3, 1)
+        own = np.empty(len(pair.block) if _holds_block(pair.shape, starts[n]) else 0, np.uint64)
+        for m in range(len(own)):
+            own[m] = pair.fixed[_number(pair.shape, starts[n]) + pair.offsets[m]]
+        cost = np.full((width, width, width), NO_COST)
+        _fill(cost, pair, starts[n], own, (np.full(3, reach), reach, 2))
+        _fill(cost, pair, starts[n], own, (_top(cost), 3, 1))
         top = _top(cost)
         i, j, k = top
         best[n, 0] = cost[i, j, k]

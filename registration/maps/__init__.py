@@ -8,7 +8,7 @@ displacement to a prior map, and `Jacobian` is its gradient. `sample_map` and `c
 from registration.maps.bspline import BSplineField
 from registration.maps.composite import CompositeTransform
 from registration.maps.field import DisplacementField, PointMap, compose, sample_map
-from registration.maps.inversion import Inversion, invert_at, invert_field
+from registration.maps.inversion import Inversion, invert_at
 from registration.maps.jacobian import Jacobian
 from registration.maps.rigid import RigidTransform
 
@@ -22,6 +22,5 @@ __all__ = [
     "RigidTransform",
     "compose",
     "invert_at",
-    "invert_field",
     "sample_map",
 ]

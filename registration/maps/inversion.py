@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from registration.maps.field import DisplacementField, PointMap, compose
-from registration.volume import Array, Grid
+from registration.maps.field import PointMap
+from registration.volume import Array
 
 
 @dataclass(frozen=True)
@@ -57,22 +57,6 @@ def invert_at(
         step[kept] = 1.0
         step[active[~better]] /= 2
     return Inversion(x, residual, count)
-
-
-def invert_field(field: PointMap, grid: Grid, start: PointMap | None = None) -> DisplacementField:
-    """The inverse map on the voxels of a grid of moving space; `inverse_residual` tells how good it is.
-
-    start: approximate inverse from which the iteration sets out, for instance that of the rigid part.
-    """
-    y = grid.points().reshape(-1, 3)
-    inverse = invert_at(field, y, None if start is None else start(y))
-    vectors = (inverse.points_fixed - y).astype(np.float32).reshape(*grid.shape, 3)
-    return DisplacementField(vectors, grid.ras_from_ijk)
-
-
-def inverse_residual(field: PointMap, inverse: DisplacementField) -> Array:
-    """|field(inverse(y)) - y| in mm on the voxels of the inverse, (ni, nj, nk) float32."""
-    return np.asarray(np.linalg.norm(compose(field, inverse).vectors, axis=3), dtype=np.float32)
 
 
 def _newton(mapping: PointMap, x: Array, gap: Array, h: float = 0.5) -> Array:

@@ -37,7 +37,7 @@ def run_tests(tree: Path, words: Sequence[str], timeout: float | None = None) ->
     """Exit code of pytest in a tree, None where it takes longer than `timeout` s, and what it says."""
     inherited = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
     process = subprocess.Popen(
-        [sys.executable, "-m", "pytest", "-q", "--tb=no", "-p", "no:cacheprovider", *words],
+        [sys.executable, "-m", "pytest", "-q", "--tb=no", "-n0", "-p", "no:cacheprovider", *words],
         cwd=tree,
         env=inherited | {"PYTHONPATH": str(tree), "OPENBLAS_NUM_THREADS": "1"},
         stdout=subprocess.PIPE,

@@ -6,6 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from materials import saint_venant_kirchhoff
 from numpy.testing import assert_allclose
 from scipy.optimize import brentq
 from shapes import box, ellipsoid
@@ -14,7 +15,6 @@ from poro.arrays import Array
 from poro.collapse.finite_strain import FiniteProblem, FiniteStatus, WallContact, deform
 from poro.contact import ChestWall, LevelSet
 from poro.fem import ConstitutiveModel, Tissue, neo_hookean, solid
-from poro.fem.constitutive import saint_venant_kirchhoff
 from poro.fem.forms import body_load, deformation_gradient, eigenstress_load, stiffness, tangent_stiffness
 from poro.fem.tissue import GRAVITY_KPA_PER_MM
 

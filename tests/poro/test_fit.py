@@ -86,6 +86,18 @@ def test_residuals_have_exact_derivatives(system: PoroSystem, truth: PoroState, 
         assert_allclose(rows.derivative(du)[smooth, k], ((ahead - behind) / (2 * h))[smooth], atol=1e-4)
 
 
+def test_distances_are_to_the_surface_and_with_plain_to_its_nearest_node(system: PoroSystem) -> None:
+    boundary, still = system.mesh.boundary, np.zeros_like(system.mesh.points)
+    corners = boundary.points[boundary.triangles]
+    outward = boundary.area_vectors / np.linalg.norm(boundary.area_vectors, axis=1)[:, None]
+    points = corners.mean(axis=1) + 2.0 * outward  # above the middles of an ellipsoid's faces, which bulges
+    target = Target(points, outward, np.ones(len(points)))
+    assert_allclose(Observer(system.mesh, target).residuals(still).value, 2.0, atol=1e-9)
+    nearest = np.linalg.norm(points[:, None] - boundary.points, axis=2).min(axis=1)
+    plain = Observer(system.mesh, target, plain=True).residuals(still).value.reshape(-1, 3)
+    assert_allclose(np.linalg.norm(plain, axis=1), nearest)
+
+
 def test_weights_do_not_hang_on_rounding(system: PoroSystem, truth: PoroState) -> None:
     """Points outside a bulging surface lie nearest to its edges and corners, which belong to several faces."""
     observer = Observer(system.mesh, _target(system, solve(system, Theta(1e-9, 0.85))))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from materials import saint_venant_kirchhoff
 from scipy.sparse import diags
 from scipy.special import spherical_in
 from shapes import box, ellipsoid, order
@@ -13,7 +14,6 @@ from poro.collapse import PoroState, PoroSystem, Theta, assemble, solve
 from poro.collapse.choice import finite_problem
 from poro.collapse.finite_strain import FiniteProblem, FiniteStatus, deform
 from poro.fem import ConstitutiveModel, Flow, Tissue, neo_hookean, solid
-from poro.fem.constitutive import saint_venant_kirchhoff
 from poro.fem.forms import consistent_mass, deformation_gradient, gradient_load, laplacian
 from poro.fem.tissue import GRAVITY_KPA_PER_MM
 from poro.linalg import linear_solver

@@ -10,6 +10,7 @@ from shapes import ellipsoid
 from poro.arrays import Array
 from poro.collapse import PoroSystem, assemble
 from poro.fem import PressureBasis, Solid, Tissue
+from poro.fem.flow import Flow
 
 
 @pytest.fixture(scope="module")
@@ -65,3 +66,21 @@ def test_rates_added_together_take_one_elastic_solution(system: PoroSystem, monk
         assert_allclose(found.u, one.u, atol=1e-8 * np.abs(one.u).max())
         assert_allclose(found.u_change, one.u_change, atol=1e-7 * np.abs(one.u_change).max())
     assert solved == [6]
+
+
+def test_a_rate_that_the_basis_knows_is_not_solved_in_full(system: PoroSystem, monkeypatch: pytest.MonkeyPatch) -> None:
+    basis = PressureBasis(system.flow, system.solid, system.pressure_load)
+    basis.enrich(np.geomspace(1e-9, 1e-7, 9))
+    whole: list[float] = []
+    plain = Flow.pressure
+
+    def counted(self: Flow, kappa_b: float) -> tuple[Array, Array]:
+        whole.append(kappa_b)
+        return plain(self, kappa_b)
+
+    monkeypatch.setattr(Flow, "pressure", counted)
+    for kappa_b in (1.5e-9, 4e-9, 2.2e-8, 7e-8):
+        basis.solve(kappa_b)
+    assert whole == []
+    basis.solve(1e-5)
+    assert whole == [1e-5]

@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from registration.maps.rigid import RigidTransform
-from registration.spine import RigidStatus, SpineSearch, register_spine
+from registration.spine import RigidStatus, SpineSearch, _near_spine, register_spine
 from registration.volume import Array, Grid, Mask, Volume
 from tests.registration.scenes import oriented
 
@@ -128,3 +128,16 @@ def test_an_empty_spine_is_refused() -> None:
     empty = Mask(np.zeros(grid.shape, dtype=bool), grid.ras_from_ijk)
     with pytest.raises(ValueError, match="spine mask is empty"):
         register_spine(scene(grid), scene(MOVING), empty)
+
+
+@pytest.mark.parametrize("height", [4, 200])
+def test_places_near_a_spine_are_those_within_reach_of_a_voxel_of_it(height: int) -> None:
+    """A rod along S of few voxels, and one of more than are compared."""
+    grid = oriented("RAS", (24, 24, height + 20), 2.0, CENTRE)
+    inside = np.zeros(grid.shape, dtype=bool)
+    inside[8:16, 8:16, 10 : 10 + height] = True
+    spine = Mask(inside, grid.ras_from_ijk)
+    first, last = grid.to_ras(np.array([[8.0, 8, 10], [12, 12, 8 + height]]))  # every fourth and second voxel is asked
+    beside, beyond = np.array([-1.0, 0, 0]), np.array([0, 0, 1.0])
+    points = np.stack([first + 29 * beside, first + 31 * beside, last + 29 * beyond, last + 31 * beyond])
+    assert _near_spine(spine, points).tolist() == [True, False, True, False]

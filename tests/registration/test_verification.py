@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from registration.keypoints.blobs import blobs
-from registration.keypoints.self_similarity import describe, find_similar
+from registration.keypoints.self_similarity import BLOCK_RADIUS, describe, find_similar
 from registration.maps.rigid import RigidTransform
 from registration.verification import LeftOver, VerifySettings, left_over, rigid_between
 from registration.volume import Array, Grid, Mask, Volume
@@ -61,6 +61,28 @@ def test_blocks_are_found_where_they_went(shift: tuple[int, int, int]) -> None:
     assert found.is_inner.all()
     near = find_similar(describe(fixed, every), describe(moving, every), every, starts, 2)
     assert near.is_inner.all() == (max(map(abs, shift)) < 2)
+
+
+@pytest.mark.parametrize("start", [(20, 20, 20), (2, 20, 20), (20, 41, 3), (5, 5, 36)])
+def test_the_cost_is_the_mean_hamming_distance_over_voxels_in_both_images(start: tuple[int, int, int]) -> None:
+    """Random descriptions; at the image's border the voxels of a block that lie in both images count."""
+    rng = np.random.default_rng(4)
+    fixed, moving = (rng.integers(0, 1 << 60, GRID.shape).astype(np.uint64) for _ in range(2))
+    every, reach = np.ones(GRID.shape, bool), 1
+    steps = np.stack(np.meshgrid(*[np.arange(-BLOCK_RADIUS, BLOCK_RADIUS + 1, 2)] * 3), -1).reshape(-1, 3)
+    block = steps[np.linalg.norm(steps, axis=1) <= 1.12 * BLOCK_RADIUS]
+
+    def cost(shift: Array) -> float:
+        here, there = block + start, block + start + shift
+        both = ((np.minimum(here, there) >= 0) & (np.maximum(here, there) < GRID.shape)).all(axis=1)
+        apart = fixed[tuple(here[both].T)] ^ moving[tuple(there[both].T)]
+        return float(np.mean([int(code).bit_count() for code in apart]))
+
+    shifts = np.stack(np.meshgrid(*[np.arange(-reach, reach + 1)] * 3), -1).reshape(-1, 3)
+    expected = [cost(shift) for shift in shifts]
+    found = find_similar(fixed, moving, every, np.array([start]), reach)
+    assert found.cost[0] == pytest.approx(min(expected))
+    assert_array_equal(np.rint(found.shift[0]), shifts[int(np.argmin(expected))])
 
 
 def test_what_is_not_allowed_is_not_found() -> None:

@@ -156,7 +156,8 @@ def prepared(usable_inflated: Array | None = None, usable_deflated: Array | None
         spines.append(Spine(bone, np.zeros((1, 3)), 300.0))
     lungs = Lungs(other, lung, airways, 0.0, {})
     gas = PleuralGas({"left": 1.0, "right": 2.0}, {"left": 3.0, "right": 400.0})
-    return Prepared(lungs, lung, cbct(inflated(), usable_inflated), cbct(deflated(), usable_deflated), *spines, gas)
+    before, after = cbct(inflated(), usable_inflated), cbct(deflated(), usable_deflated)
+    return Prepared(lungs, lung, spines[0], before, spines[1], after, spines[2], gas)
 
 
 def rigid_fit(moving_from_fixed: RigidTransform) -> RigidFit:

@@ -44,6 +44,14 @@ else:
     errors = {"mean": mm, "p95": 2 * mm, "max": 3 * mm}
     scores = {"phase1": errors, "phase2": errors, "chain": errors}
     scores |= {"nodule_deflated_mm": mm / 2, "nodule_in_ellipsoid95": mm < 5}
+    if name in ("good", "gated"):
+        tissue = {"chain": {"mean": 2.5 if name == "gated" else 1.5, "p95": 4.0, "max": 9.0}}
+        shallow = [{"from_mm": f, "to_mm": f + 5, "n": 100 + f, "chain": {"mean": 3.0 - f / 5, "p95": 6.0 - f / 5},
+                    "share_in_radius95": 0.9 + f / 50} for f in (0.0, 5.0)]
+        deeper = [{"from_mm": f, "to_mm": t, "n": 0, "chain": None, "share_in_radius95": None}
+                  for f, t in ((10.0, 20.0), (20.0, 30.0), (30.0, None))]
+        scores["dense"] = {"inside_fov": tissue, "by_depth": shallow + deeper}
+        scores["nodule_deflated_mm"] = 2.9 if name == "gated" else 0.5
     (Path(rest[0]) / "tre.json").write_text(json.dumps(scores))
 """
 NAMES = ("good", "gated", "wrong", "crash", "refused", "bare")
@@ -84,9 +92,18 @@ def test_every_case_gets_its_line_although_one_crashes(
     assert "http" not in page
     lines = (tmp_path / "out" / "cohort.md").read_text().splitlines()
     assert lines[2].startswith(
-        "| good | 0 | 1.00 / 2.00 / 3.00 | 1.00 / 2.00 / 3.00 | 1.00 / 2.00 / 3.00 | 0.50 | yes |"
+        "| good | 0 | 1.00 / 2.00 / 3.00 | 1.00 / 2.00 / 3.00 | 1.00 / 2.00 / 3.00 | 3.00 / 6.00 | 2.00 / 5.00 | 0.50 "
     )
     assert "holds the nodule in 1 of 3 cases (1 of 2 under exit code 0)" in lines[-1]
+    assert "tissue in view by depth below the pleura: 90.0 % at 0 to 5 mm, 100.0 % at 5 to 10 mm. False" in lines[-1]
+    assert "(a gate failed, yet nodule and tissue are right to 3 mm on average): 1 of 2." in lines[-1]
+    assert [outcomes[name].false_alarm for name in ("good", "gated", "wrong")] == [False, True, None]
+    assert (rows[0]["tissue_0_5_mean_mm"], rows[0]["tissue_5_10_p95_mm"], rows[2]["tissue_0_5_mean_mm"]) == (
+        "3.0",
+        "5.0",
+        "",
+    )
+    assert (rows[1]["tissue_in_view_mm"], rows[1]["false_alarm"]) == ("2.5", "True")
     assert lines[-1].endswith("Silent failures (nodule or mean landmark error over 10 mm under exit code 0): 1 of 3.")
 
 

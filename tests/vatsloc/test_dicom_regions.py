@@ -11,9 +11,9 @@ from pydicom.dataset import Dataset
 from pydicom.uid import generate_uid
 
 from registration.volume import Grid
+from tests.vatsloc.case_scene import ball, chest, grid_at, write_toml
 from tests.vatsloc.dicom_drawn import OBLIQUE, blob, grid, rectangle, segmentation, structures, written
 from tests.vatsloc.dicom_made import FRAME, ct_slice, save
-from tests.vatsloc.test_case import ball, chest, grid_at, write_toml
 from vatsloc.case import read_case
 from vatsloc.errors import InputRefused
 from vatsloc.formats.dicom.contours import even_odd
@@ -66,6 +66,32 @@ def test_one_slice_has_a_thickness(tmp_path):
     mask = read_mask(written(segmentation(on, {"nodule": blob(on, (2, 5), (3, 6), (4, 5))}), tmp_path / "seg.dcm"))
     assert_allclose(mask.grid.spacing, [2, 1.5, 3], atol=1e-6)
     assert mask.inside.sum() == 9
+
+
+@pytest.mark.parametrize(
+    ("stated", "thick"),
+    [
+        ({"SpacingBetweenSlices": 3, "SliceThickness": 5}, 3.0),
+        ({"SliceThickness": 5}, 5.0),
+        ({"SpacingBetweenSlices": 0, "SliceThickness": 5}, 5.0),
+    ],
+)
+def test_one_slice_is_as_thick_as_slices_are_apart_or_else_as_stated(tmp_path, stated, thick):
+    on = grid()
+    ds = segmentation(on, {"nodule": blob(on, (2, 5), (3, 6), (4, 5))})
+    measures = ds.SharedFunctionalGroupsSequence[0].PixelMeasuresSequence[0]
+    del measures.SpacingBetweenSlices
+    for name, value in stated.items():
+        setattr(measures, name, value)
+    assert read_mask(written(ds, tmp_path / "seg.dcm")).grid.spacing[2] == pytest.approx(thick)
+
+
+def test_one_slice_without_a_thickness_is_refused(tmp_path):
+    on = grid()
+    ds = segmentation(on, {"nodule": blob(on, (2, 5), (3, 6), (4, 5))})
+    del ds.SharedFunctionalGroupsSequence[0].PixelMeasuresSequence[0].SpacingBetweenSlices
+    with pytest.raises(InputRefused, match="states no SpacingBetweenSlices"):
+        read_mask(written(ds, tmp_path / "seg.dcm"))
 
 
 def test_contours_are_filled_by_even_odd(tmp_path):

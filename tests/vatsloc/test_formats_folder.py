@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from vatsloc.errors import CaseError
+from vatsloc.formats import folder
 from vatsloc.formats.folder import is_result, remove_leftovers, whole_folder, write_whole
 
 N_FILES = 30
@@ -101,6 +102,18 @@ def test_leftovers_of_other_results_stay(tmp_path):
     assert hidden(tmp_path) == [".other.partial-0123abcd"]
 
 
+def test_a_leftover_that_another_run_removes_at_the_same_time_is_no_error(tmp_path, monkeypatch):
+    (tmp_path / ".out.partial-0123abcd").mkdir()
+
+    def removed_by_the_other_run(leftover):
+        leftover.rmdir()
+        return False
+
+    monkeypatch.setattr(folder, "_locked", removed_by_the_other_run)
+    remove_leftovers(tmp_path / "out")
+    assert hidden(tmp_path) == []
+
+
 @pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt, SystemExit])
 def test_an_exception_leaves_the_earlier_result_and_nothing_else(tmp_path, error):
     write_result(tmp_path / "out", "old")
@@ -116,12 +129,24 @@ def test_an_exception_leaves_the_earlier_result_and_nothing_else(tmp_path, error
     assert hidden(tmp_path) == []
 
 
+def test_an_exception_is_told_even_if_its_folder_is_gone(tmp_path):
+    def fail():
+        with whole_folder(tmp_path / "out") as folder:
+            folder.rmdir()
+            raise ValueError("first cause")
+
+    with pytest.raises(ValueError, match="first cause"):
+        fail()
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_nothing_is_at_the_target_before_the_end(tmp_path):
-    with whole_folder(tmp_path / "deep" / "out") as folder:
+    target = tmp_path / "new" / "deep" / "out"
+    with whole_folder(target) as folder:
         (folder / "run.json").write_text('{"program": "vatsloc"}')
-        assert not (tmp_path / "deep" / "out").exists()
-        assert folder.parent == tmp_path / "deep"
-    assert is_result(tmp_path / "deep" / "out")
+        assert not target.exists()
+        assert folder.parent == target.parent
+    assert is_result(target)
 
 
 def test_an_incomplete_result_is_not_made(tmp_path):

@@ -10,7 +10,7 @@ from registration.volume import Volume
 from tests.vatsloc import imaging_thorax as known
 from vatsloc.errors import InputRefused
 from vatsloc.imaging.cbct import Cupping, field_of_view, prepare_cbct
-from vatsloc.imaging.spine import segment_spine
+from vatsloc.imaging.spine import _column, segment_spine
 
 
 def test_cylinder_and_bad_slices_are_found() -> None:
@@ -93,6 +93,18 @@ def test_spine_is_the_column_of_vertebrae_in_ct_and_cbct() -> None:
         assert_allclose(spine.centres_ras[:, 1], -58.0, atol=8.0)
         assert spine.mask.inside[scene.vertebrae.inside & seen].mean() > 0.97
         assert spine.mask.inside.sum() < 4.0 * (scene.vertebrae.inside & seen).sum()
+
+
+@pytest.mark.parametrize("more_below", [True, False])
+def test_the_column_runs_through_the_most_bone_wherever_along_it_that_is(more_below: bool) -> None:
+    """Bone at one place in the lower half and at another, too far to bend to, in the upper half."""
+    g = known.grid((80, 24, 48), 2.5)
+    soft = Volume(np.full(g.shape, 40.0, dtype=np.float32), g.ras_from_ijk)
+    excess, seen = np.zeros(g.shape, dtype=np.float32), np.ones(g.shape, dtype=bool)
+    excess[8:12, 4:8, :24] = 100.0 if more_below else 98.0
+    excess[66:70, 4:8, 24:] = 98.0 if more_below else 100.0
+    path = _column(soft, excess, seen, np.arange(g.shape[2]))
+    assert_allclose(path[:20] if more_below else path[28:], [[9.5 if more_below else 67.5, 5.5]] * 20, atol=1.0)
 
 
 def test_image_without_bone_has_no_spine() -> None:

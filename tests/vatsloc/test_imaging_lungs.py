@@ -13,7 +13,7 @@ from tests.vatsloc import imaging_thorax as known
 from vatsloc.case import read_case
 from vatsloc.errors import InputRefused
 from vatsloc.imaging.hilum import find_hilum
-from vatsloc.imaging.lungs import segment_lungs
+from vatsloc.imaging.lungs import _midline, _sides, segment_lungs
 
 
 def ball(centre: tuple[float, float, float], radius: float) -> Mask:
@@ -114,6 +114,34 @@ def test_ct_cropped_through_the_other_lung_keeps_both() -> None:
     lungs = segment_lungs(Volume(scene.volume.hu[start:].copy(), affine), "right")
     truth = Mask(scene.lungs["right"].inside[start:], affine)
     assert known.dice(lungs.right, truth) > 0.96
+
+
+@pytest.mark.parametrize("neck_mm", [-4.0, 0.0, 4.0])
+def test_lungs_that_touch_are_parted_where_they_are_thinnest(neck_mm: float) -> None:
+    """Two balls that meet away from the midline: a cut along it would take a cap off one of them."""
+    g = known.grid((60, 40, 40), 2.0)
+    x = g.points()
+    left, right = (np.linalg.norm(x - [r, 0, 0], axis=-1) < 26.0 + sign * neck_mm for r, sign in ((-26, 1), (26, -1)))
+    found = _sides(g, [left | right], 0.0)
+    assert (found["left"] ^ found["right"])[left | right].all()
+    assert not (found["left"] | found["right"])[~(left | right)].any()
+    for name, ball_inside in (("left", left), ("right", right)):
+        assert (found[name] ^ ball_inside).sum() < 0.005 * ball_inside.sum()
+
+
+def test_the_midline_runs_through_a_windpipe_of_one_slice() -> None:
+    g = known.grid((20, 10, 10), 2.0)
+    airways = np.zeros(g.shape, dtype=bool)
+    airways[11:14, 4:6, 7] = True
+    lung = np.zeros(g.shape, dtype=bool)
+    lung[2:8] = True
+    assert _midline(g, [lung], airways) == g.to_ras(np.array([12.0, 0, 0]))[0]
+    airways[11:14, 4:6, 5:9], airways[2:5, 4:6, 1:3] = True, True  # bronchi, in the lower half, are not asked
+    assert _midline(g, [lung], airways) == g.to_ras(np.array([12.0, 0, 0]))[0]
+    assert _midline(g, [lung], np.zeros(g.shape, dtype=bool)) == g.to_ras(np.array([4.5, 0, 0]))[0]
+    assert _midline(g, [lung, np.roll(lung, 8, axis=0)], np.zeros(g.shape, dtype=bool)) == pytest.approx(
+        g.to_ras(np.array([8.5, 0, 0]))[0]
+    )
 
 
 @pytest.mark.shared

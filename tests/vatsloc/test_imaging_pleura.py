@@ -16,7 +16,7 @@ from vatsloc.errors import InputRefused
 from vatsloc.imaging.cbct import PreparedCbct, prepare_cbct
 from vatsloc.imaging.hilum import track_hilum
 from vatsloc.imaging.lungs import segment_lungs
-from vatsloc.imaging.pleura import Pneumothorax, air_limit, find_pneumothorax
+from vatsloc.imaging.pleura import Pneumothorax, _lung_beside, air_limit, find_pneumothorax
 from vatsloc.imaging.surface import Border, deflated_surface, diaphragm_points
 from vatsloc.imaging.thorax import ThoraxPrior, carry_prior, inflated_lung, require_share, visible_share
 
@@ -93,6 +93,17 @@ def test_pleural_air_and_collapsed_lung_are_told_apart(found: Pneumothorax) -> N
     air = Mask(old & ~truth.inside & (known.thorax().volume.hu < -500), truth.ras_from_ijk)
     assert known.dice(found.air, air) > 0.9
     assert not (found.air.inside & known.thorax().lungs["left"].inside).any()
+
+
+def test_dense_lung_between_air_and_aerated_lung_is_lung() -> None:
+    """A layer of 6 mm without air, as lung that collapsed first has it, between the gas and the aerated lung."""
+    g = known.grid((40, 40, 40), 2.0)
+    r = np.linalg.norm(g.points(), axis=-1)
+    aerated, air = r < 24.0, (r > 30.0) & (r < 38.0)
+    lung = _lung_beside(aerated, air, g, g)
+    assert lung[aerated].mean() > 0.99
+    assert lung[(r > 24.5) & (r < 29.5)].mean() > 0.95
+    assert not lung[r > 30.0].any()
 
 
 def test_air_border_lies_on_the_ellipsoid_and_normals_point_out(found: Pneumothorax, deflated: PreparedCbct) -> None:

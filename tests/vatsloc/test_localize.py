@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import shutil
 import signal
 import subprocess
@@ -54,11 +55,32 @@ def blind_case(case: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+class OpenedFiles:
+    """Names of the files that Python opens while `on`. Python keeps an audit hook until it ends."""
+
+    def __init__(self) -> None:
+        self.names: set[str] = set()
+        self.on = True
+        sys.addaudithook(self._note)
+
+    def _note(self, event: str, arguments: tuple[Any, ...]) -> None:
+        if self.on and event == "open" and isinstance(arguments[0], str | bytes):
+            self.names.add(os.fsdecode(arguments[0]))
+
+
 @pytest.fixture(scope="module")
-def result(blind_case: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def watched(blind_case: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, OpenedFiles]:
+    """The result of a run, and the files that it opened."""
     folder = tmp_path_factory.mktemp("result") / "demo"
+    opened = OpenedFiles()
     run_case(blind_case, folder, load_settings("fast", None))
-    return folder
+    opened.on = False
+    return folder, opened
+
+
+@pytest.fixture(scope="module")
+def result(watched: tuple[Path, OpenedFiles]) -> Path:
+    return watched[0]
 
 
 @pytest.fixture(scope="module")
@@ -68,6 +90,15 @@ def run(result: Path) -> dict[str, Any]:
 
 def test_every_output_is_there(result: Path) -> None:
     assert sorted(path.name for path in result.iterdir()) == sorted(OUTPUT_FILES)
+
+
+def test_of_the_case_only_what_it_names_for_a_run_is_opened(
+    blind_case: Path, watched: tuple[Path, OpenedFiles]
+) -> None:
+    """Neither landmarks nor truth; `test_a_second_run_...` shows that without them all is the same byte for byte."""
+    of_case = {Path(name).relative_to(blind_case) for name in watched[1].names if Path(name).is_relative_to(blind_case)}
+    named = {"ct.nii.gz", "cbct_inflated.nii.gz", "cbct_deflated.nii.gz", "nodule.nii.gz"}
+    assert {path.as_posix() for path in of_case} == {"case.toml", *named}
 
 
 def test_run_holds_the_agreed_keys(run: dict[str, Any]) -> None:
@@ -182,7 +213,6 @@ def test_warped_ct_looks_like_the_deflated_cbct_in_the_lung(case: Path, result: 
     assert agreement > 0.8
 
 
-@pytest.mark.study
 def test_a_second_run_without_landmarks_and_truth_writes_the_same(case: Path, result: Path, tmp_path: Path) -> None:
     bare = tmp_path / "bare"
     shutil.copytree(case, bare)
@@ -191,7 +221,12 @@ def test_a_second_run_without_landmarks_and_truth_writes_the_same(case: Path, re
         path.unlink()
     run_case(bare, tmp_path / "demo", load_settings("fast", None))
     for name in OUTPUT_FILES:
-        if name not in ("run.json", "report.html", "scene_with_scans.mrml"):  # the scene names the case's files
+        if name not in (
+            "run.json",
+            "report.html",
+            "scene_with_scans.mrml",
+            "inputs.json",
+        ):  # the last two name the case
             assert _digest(tmp_path / "demo" / name) == _digest(result / name), name
     here, there = (json.loads((folder / "run.json").read_text()) for folder in (tmp_path / "demo", result))
     assert {k: v for k, v in here.items() if k not in TIMED} == {k: v for k, v in there.items() if k not in TIMED}

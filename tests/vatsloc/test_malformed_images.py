@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from registration.maps.field import DisplacementField
 from registration.volume import Volume
+from tests.vatsloc.image_files import affine_of, metaimage_header
 from tests.vatsloc.malformed import bounded, junk, read_or_refused
-from tests.vatsloc.test_formats_images import affine_of, metaimage_header
 from vatsloc.errors import InputRefused, VatslocError
 from vatsloc.formats.fields import read_field, write_field
 from vatsloc.formats.images import read_mask, read_region, read_volume

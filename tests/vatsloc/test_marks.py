@@ -1,7 +1,5 @@
 """The nodule as users mark it: label images, segmentations, cropped masks, points; and what is refused."""
 
-# ruff: noqa: F401, F811  (the fixture `folder` comes from the tests of whole cases)
-
 from __future__ import annotations
 
 import json
@@ -12,7 +10,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from registration.volume import Grid, Mask
-from tests.vatsloc.test_case import CENTRE, ball, folder, grid_at, point, refused, write_toml
+from tests.vatsloc.case_scene import CENTRE, ball, check_refused, grid_at, point, whole_case, write_toml
 from vatsloc.case import read_case
 from vatsloc.errors import CaseError, InputRefused
 from vatsloc.formats.images import read_mask, read_region
@@ -22,6 +20,11 @@ from vatsloc.frames import flip_affine
 from vatsloc.marks import NoduleSource, read_nodule
 
 LUNG = np.array([-40.0, 0, 0])
+
+
+@pytest.fixture
+def folder(tmp_path) -> Path:
+    return whole_case(tmp_path)
 
 
 def label_map(path: Path, *masks: Mask) -> None:
@@ -64,7 +67,7 @@ def test_a_label_map_without_a_label_is_refused_and_listed(folder):
     lung, nodule = ball(grid_at(), LUNG, 40.0), ball(grid_at())
     label_map(folder / "nodule.nii.gz", lung, nodule)
     counts = f"1 with {lung.inside.sum()} voxels, 2 with {nodule.inside.sum()} voxels"
-    refused(folder, InputRefused, rf"holds 2 regions: {counts}; say which is meant: \[nodule\] label = \.\.\.")
+    check_refused(folder, InputRefused, rf"holds 2 regions: {counts}; say which is meant: \[nodule\] label = \.\.\.")
 
 
 def test_the_label_chooses_the_nodule(folder):
@@ -75,7 +78,7 @@ def test_the_label_chooses_the_nodule(folder):
     assert np.array_equal(nodule.mask.inside, ball(grid_at()).inside)
     assert_allclose(nodule.centre_ras, grid_at().points()[ball(grid_at()).inside].mean(axis=0), atol=1e-4)
     write_toml(folder, nodule={"mask": "nodule.nii.gz", "label": 3})
-    refused(
+    check_refused(
         folder, InputRefused, "holds nothing of label 3 among 1 with .* voxels, 2 with .* voxels; name one of these"
     )
 
@@ -136,6 +139,17 @@ def test_overlapping_segments_lie_in_layers(tmp_path):
     assert np.array_equal(read_region(tmp_path / "old.seg.nrrd", "nodule").inside, layers[1] == 1)
 
 
+@pytest.mark.parametrize("value", [1, 2])
+def test_two_segments_of_one_value_in_one_layer_are_refused(tmp_path, value):
+    """The lung would be read in the nodule's place."""
+    labels = np.zeros((1, 6, 6, 6), dtype=np.uint8)
+    labels[0, :4], labels[0, 2, 2, 2:4] = 1, 2
+    segments = [{"Name": name, "LabelValue": value, "Layer": 0} for name in ("lung", "nodule")]
+    seg_nrrd(tmp_path / "s.seg.nrrd", labels, Grid((6, 6, 6), np.eye(4)), *segments)
+    with pytest.raises(InputRefused, match=f'gives segments "lung" and "nodule" the same value {value} in one layer'):
+        read_region(tmp_path / "s.seg.nrrd", "nodule")
+
+
 def test_a_segmentation_without_voxels_is_refused(tmp_path):
     seg_nrrd(tmp_path / "s.seg.nrrd", np.zeros((1, 1, 1, 1)), Grid((1, 1, 1), np.eye(4)), {"Name": "nodule"})
     with pytest.raises(InputRefused, match="a segmentation without voxels; draw the region"):
@@ -184,7 +198,7 @@ def test_what_lies_beyond_the_ct_is_said(tmp_path):
 
 def test_a_mask_as_large_as_a_lung_is_no_nodule(folder):
     write_mask(folder / "nodule.nii.gz", ball(grid_at(), LUNG, 50.0))
-    refused(
+    check_refused(
         folder, InputRefused, r"marks \d+ ml, 100 x 100 x 100 mm, up to 250 ml expected of a nodule; draw the nodule"
     )
 
@@ -204,7 +218,9 @@ def test_points_never_placed_are_left_out_and_said(folder, status):
 def test_a_point_in_metres_is_refused(folder):
     point(folder / "p.mrk.json", CENTRE / 1000)
     write_toml(folder, nodule={"point": "p.mrk.json"})
-    refused(folder, InputRefused, r"a point at 0\.06, 0\.01, -0\.02 \(RAS\), which reads like metres; save it in mill")
+    check_refused(
+        folder, InputRefused, r"a point at 0\.06, 0\.01, -0\.02 \(RAS\), which reads like metres; save it in mill"
+    )
 
 
 @pytest.mark.parametrize(("scale", "measured"), [(1e-3, "0.0707 x 0.0707 x 0.0707"), (100.0, "7.07e")])
@@ -213,7 +229,7 @@ def test_a_surface_of_another_size_is_refused(folder, scale, measured):
     corners = np.array([[a, b, c] for a in (-1, 1) for b in (-1, 1) for c in (-1, 1)]) * 50 / np.sqrt(2)
     write_points(folder / "s.mrk.json", PointList(corners * scale, tuple("abcdefgh")))
     write_toml(folder, hints={"deflated_surface": "s.mrk.json"})
-    refused(folder, InputRefused, rf"measures {measured}.* mm, which no lung does; save it in millimetres")
+    check_refused(folder, InputRefused, rf"measures {measured}.* mm, which no lung does; save it in millimetres")
 
 
 @pytest.mark.parametrize(
@@ -227,7 +243,7 @@ def test_an_image_of_another_unit_is_refused(folder, scale, sentence):
     case = read_case(folder)
     affine = case.ct.ras_from_ijk @ np.diag([scale, scale, scale, 1])
     save_nifti(nifti_image(case.ct.hu.astype(np.int16), affine), folder / "ct.nii.gz")
-    refused(folder, InputRefused, sentence)
+    check_refused(folder, InputRefused, sentence)
 
 
 def test_a_case_file_with_a_byte_order_mark_is_read(folder):
@@ -250,4 +266,4 @@ def test_a_case_file_with_a_byte_order_mark_is_read(folder):
 )
 def test_labels_that_are_none_are_refused(folder, nodule, sentence):
     write_toml(folder, nodule=nodule)
-    refused(folder, CaseError, sentence)
+    check_refused(folder, CaseError, sentence)

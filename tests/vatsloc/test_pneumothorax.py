@@ -16,10 +16,11 @@ from registration.volume import Array
 from tests.vatsloc import ball_scene as scene
 from vatsloc.workflow import pneumothorax as module
 from vatsloc.workflow.model_selection import CollapseModel, Refinement
-from vatsloc.workflow.pneumothorax import RESIDUAL, Collapse, collapse, contact_surface, pneumothorax
+from vatsloc.workflow.pneumothorax import REFINEMENT, RESIDUAL, Collapse, collapse, contact_surface, pneumothorax
 from vatsloc.workflow.pose import ChangeOfPose
+from vatsloc.workflow.refinement import BlockRefinement, Compared, Shape
 from vatsloc.workflow.residual import Residual
-from vatsloc.workflow.settings import settings_of
+from vatsloc.workflow.settings import RefinementSettings, settings_of
 from vatsloc.workflow.stages import Stages
 
 TRIED = Refinement("regional fit", 3.0, 2.0, False)
@@ -60,9 +61,11 @@ class Parts:
         moved = scene.collapsed(coarse.points) - coarse.points
         self.model = CollapseModel(system, nothing, moved, self.pairs, tuple(refinements), nothing, np.zeros((0, 0, 3)))
         self.asked: list[tuple[Any, ...]] = []
+        self.refined: list[tuple[Compared, Shape]] = []
+        self.off = np.zeros(3)
 
     def run(self, monkeypatch: pytest.MonkeyPatch, images: Residual | None, **tables: Any) -> Collapse:
-        case: Any = SimpleNamespace(gravity_ras=np.array([1.0, 0, 0]))
+        case: Any = SimpleNamespace(gravity_ras=np.array([1.0, 0, 0]), ct=scene.ct())
         settings = settings_of("balanced", tables)
 
         def select_model(gravity: Array, *rest: Any) -> CollapseModel:
@@ -74,6 +77,12 @@ class Parts:
             self.asked.append(values)
             return images
 
+        def refine(compared: Compared, shape: Shape, chosen: RefinementSettings) -> BlockRefinement:
+            assert chosen == settings.refinement
+            self.refined.append((compared, shape))
+            return BlockRefinement(shape.map.moved + self.off, ())
+
+        monkeypatch.setattr(module, "refine_by_blocks", refine)
         monkeypatch.setattr(module, "select_model", select_model)
         monkeypatch.setattr(module, "residual_registration", correct)
         return collapse(case, self.prepared, self.pose, self.observed, settings, self.stages)
@@ -97,7 +106,7 @@ def test_the_lungs_nodes_go_where_the_models_displacement_and_then_the_images_ta
     assert_array_equal(found.mesh_after.points, found.points_after)
     assert_array_equal(found.mesh_after.tets, parts.before.tets)
     assert found.residual is images
-    assert list(parts.stages.seconds) == [RESIDUAL]
+    assert list(parts.stages.seconds) == [RESIDUAL, REFINEMENT]
 
 
 def test_the_residual_registration_is_asked_in_the_frames_of_the_scans(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -158,6 +167,34 @@ def test_a_model_that_predicts_unseen_places_makes_the_images_superfluous(
     assert (choice.part, choice.kept, choice.limit) == (RESIDUAL, kept, limit)
     assert choice.value == (parts.model.held_out_mm if refinements else np.inf)
     assert (RESIDUAL in parts.stages.skipped) is not kept
+
+
+def test_blocks_of_the_ct_refine_what_model_and_images_made(monkeypatch: pytest.MonkeyPatch) -> None:
+    parts = Parts()
+    parts.off = np.array([1.0, -2.0, 0.5])
+    images = correction(parts)
+    found = parts.run(monkeypatch, images)
+    ((compared, shape),) = parts.refined
+    assert compared.ct is scene.ct()
+    assert compared.lung_ct is parts.prepared.lung_ct
+    assert compared.scan is parts.prepared.deflated
+    assert compared.lung is parts.observed.found.lung
+    assert shape.rest is parts.before
+    assert shape.map.mesh is parts.pose.mesh_ct
+    assert_allclose(shape.map.around.matrix, (scene.DEF_FROM_INF @ scene.INF_FROM_CT).matrix, atol=1e-12)
+    assert (len(shape.anchors), shape.within_mm) == (0, np.inf)
+    inner = scene.inner_nodes(parts.before, scene.CENTRE_DEF, 35.0)
+    truth = scene.collapsed(parts.before.points)
+    assert_allclose((shape.map.moved - images.displacement)[inner], truth[inner], atol=1e-6)
+    assert_array_equal(found.points_after, shape.map.moved + parts.off)
+    assert found.refinement is not None
+
+
+def test_a_refinement_that_is_switched_off_is_not_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+    parts = Parts()
+    found = parts.run(monkeypatch, None, refinement={"on": False})
+    assert (found.refinement, parts.refined) == (None, [])
+    assert parts.stages.skipped == {REFINEMENT: "switched off in the settings"}
 
 
 def test_a_collapse_shows_its_parts(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -30,6 +30,7 @@ from vatsloc.workflow.pose import (
     ffd_settings,
     moved_far,
 )
+from vatsloc.workflow.refinement import BlockRefinement
 from vatsloc.workflow.settings import settings_of
 from vatsloc.workflow.stages import Stages
 
@@ -60,12 +61,19 @@ class Watched:
         self.case: Any = SimpleNamespace(ct=scene.ct(), side="right", hints=hints)
         self.prior, self.lung_inf = object(), scene.empty(scene.inflated())
         self.fit: Any = scene.sliding_fit(50, 0.0, moved_back)
+        self.off = np.zeros(3)
         for name, answer in (
             ("register_spine", scene.rigid_fit(CT_FROM_INF)),
             ("carry_prior", self.prior),
             ("inflated_lung", self.lung_inf),
         ):
             monkeypatch.setattr(module, name, self._asked(name, answer))
+
+        monkeypatch.setattr(module, "refine_by_blocks", self._refine)
+
+    def _refine(self, *values: Any) -> BlockRefinement:
+        self.asked["refine_by_blocks"] = values
+        return BlockRefinement(values[1].map.moved + self.off, ())
 
     def _asked(self, name: str, answer: Any) -> Any:
         def ask(*values: Any, **named: Any) -> Any:
@@ -145,7 +153,32 @@ def test_seen_nodes_go_where_the_inverted_field_says_and_the_others_go_on_smooth
         "mesh",
         "free-form deformation",
         "inversion and extrapolation",
+        "block refinement, inflated",
     ]
+
+
+def test_blocks_near_the_pleura_refine_the_pose_and_deep_seen_nodes_stay(watched: Watched) -> None:
+    watched.off = np.array([0.5, 1.0, -2.0])
+    found = watched.run()
+    compared, shape, settings = watched.asked["refine_by_blocks"]
+    assert (compared.ct, compared.lung_ct) == (watched.case.ct, watched.prepared.lung_ct)
+    assert (compared.scan, compared.lung) == (watched.prepared.inflated, watched.lung_inf)
+    assert_allclose(shape.rest.points, scene.INF_FROM_CT(found.mesh_ct.points))
+    assert shape.map.mesh is found.mesh_ct
+    depth = scene.RADIUS_MM - np.linalg.norm(found.mesh_ct.points - scene.CENTRE_CT, axis=1)
+    assert_array_equal(np.isin(np.arange(len(depth)), shape.anchors)[depth > 18.0], found.seen[depth > 18.0])
+    assert not (depth[shape.anchors] < 14.0).any()
+    assert shape.within_mm == 16.0
+    assert_array_equal(found.points_inf, shape.map.moved + watched.off)
+    assert found.refinement is not None
+    assert settings == settings_of("balanced").refinement
+
+
+def test_without_the_refinement_the_pose_is_the_registrations(watched: Watched) -> None:
+    found = watched.run(refinement={"on": False})
+    assert found.refinement is None
+    assert "refine_by_blocks" not in watched.asked
+    assert watched.stages.skipped["block refinement, inflated"] == "switched off in the settings"
 
 
 def test_the_mesh_fills_the_operated_lung_of_the_ct(watched: Watched) -> None:

@@ -238,7 +238,12 @@ def scores(**changes):
     depth = {"chain": [{"from_mm": 0.0, "to_mm": 10.0, **one}, {"from_mm": 10.0, "to_mm": None, **one}]}
     summary |= {"nodule_inflated_mm": None, "nodule_deflated_mm": 2.7, "nodule_in_ellipsoid95": False}
     summary |= {"in_radius95": {"landmarks": {"share": 0.75, "n": 40, "median_mm": 4.25}}}
-    summary |= {"wilcoxon_p": {"chain": 1e-6}, "by_depth": depth, "warnings": ["Two <landmarks> left out."]}
+    summary |= {
+        "wilcoxon_p": {"chain": 1e-6},
+        "by_depth": depth,
+        "dense": None,
+        "warnings": ["Two <landmarks> left out."],
+    }
     return TreSection(summary | changes, {m: np.array([1.0, 2, 4, np.nan]) for m in MEASURE_NAMES})
 
 
@@ -256,6 +261,13 @@ def test_scores_are_written_into_the_page_and_over_older_ones(page):
     assert "9.87 mm off" in again
     assert "2.70 mm off" not in again
     assert with_scores(again, scores()) == filled
+    assert 'id="tissue"' not in filled
+    shallow = {"from_mm": 0.0, "to_mm": 5.0, "n": 77, "phase1": {"mean": 1.11, "p95": 2.22}}
+    shallow |= {"chain": {"mean": 3.33, "p95": 4.44}, "share_in_radius95": 0.956}
+    nothing = {"from_mm": 30.0, "to_mm": None, "n": 0, "phase1": None, "chain": None, "share_in_radius95": None}
+    tissue = with_scores(page, scores(dense={"by_depth": [shallow, nothing]}))
+    row = tissue.partition('id="tissue"')[2].partition("<tbody>")[2].partition("</tbody>")[0]
+    assert re.findall(r">([^<>\n]+)<", row) == ["0 to 5", "1.11", "2.22", "3.33", "4.44", "96 %", "77"]
     untold = {"landmarks": {"share": None, "n": 0, "median_mm": None}}
     assert "95 % radius" not in with_scores(page, scores(in_radius95=untold))
 

@@ -8,13 +8,16 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
+from typing import Any
+from unicodedata import normalize
 
 import numpy as np
 import pytest
+from pypdf import PdfReader
 
 from registration.maps.rigid import RigidTransform
 from registration.volume import Volume
-from tests.vatsloc.browser import CHROMIUM, asked_by_the_page, visit
+from tests.vatsloc.browser import CHROMIUM, asked_by_the_page, printed, visit
 from vatsloc.formats.meshes import Surface
 from vatsloc.report.data import Comparison, Landmark, Motion, Nodule, ReportData
 from vatsloc.report.render import write_report
@@ -48,6 +51,23 @@ setTimeout(() => {
     pen.canvas.width = seen.naturalWidth; pen.canvas.height = seen.naturalHeight; pen.drawImage(seen, 0, 0);
     found[name + "_bright"] = count(pen.canvas, (r) => r > 100);
   }
+  const wide = space.width, high = space.height, rim = [];
+  const rgba = space.getContext("2d").getImageData(0, 0, wide, high).data;
+  const is = (x, y) => {
+    const [r, g, b] = rgba.subarray(4 * (y * wide + x));
+    return r > 40 && r > g + 10 && g > b + 8;
+  };
+  let n = 0, mx = 0, my = 0;
+  for (let y = 0; y < high; y++) for (let x = 0; x < wide; x++) if (is(x, y)) { n++; mx += x; my += y; }
+  for (let d = 0; d < 2 * Math.PI; d += Math.PI / 180) {
+    let far = 0;
+    for (let r = 1; r < high / 2; r += 0.25) {
+      const x = Math.round(mx / n + r * Math.cos(d)), y = Math.round(my / n + r * Math.sin(d));
+      if (x >= 0 && y >= 0 && x < wide && y < high && is(x, y)) far = r;
+    }
+    rim.push(far);
+  }
+  found.rim = rim;
   found.wide = document.documentElement.scrollWidth;
   const result = document.createElement("pre");
   result.id = "found"; result.textContent = JSON.stringify(found);
@@ -62,8 +82,7 @@ def image(inside_hu: float) -> Volume:
     return Volume(hu, AFFINE)
 
 
-@pytest.fixture(scope="module")
-def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def data(motion: Motion, marks: tuple[Landmark, ...] = (), **run: Any) -> ReportData:
     phase = Comparison(
         title="Phase 2",
         fixed_name="deflated CBCT",
@@ -75,25 +94,30 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
         after=image(-400),
         nodule=Nodule(NODULE, np.diag([8.0, 6, 5])),
     )
-    cage = Surface(40 * CORNERS, TRIANGLES)
-    motion = Motion(TRIANGLES, 40 * CORNERS, 20 * CORNERS, cage, NODULE + np.array([20.0, 0, 0]))
-    run = {"seconds": {"fit": 2.0, "total": 3.0}, "gates": {}, "warnings": [], "side": "right"}
+    record = {"seconds": {"fit": 2.0, "total": 3.0}, "gates": {}, "warnings": [], "side": "right"} | run
+    foot = np.array([20.0, -8, 4])
+    return ReportData("boxes", record, phase.nodule, (phase,), (), 9.0, foot, marks, motion)
+
+
+BOXES = Motion(TRIANGLES, 40 * CORNERS, 20 * CORNERS, Surface(40 * CORNERS, TRIANGLES), NODULE + np.array([20.0, 0, 0]))
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     marks = (Landmark("apex", np.array([20.0, 20, 20]), 30.0, True),)
     path = tmp_path_factory.mktemp("page") / "report.html"
-    write_report(
-        path, ReportData("boxes", run, phase.nodule, (phase,), (), 9.0, np.array([20.0, -8, 4]), marks, motion)
-    )
+    write_report(path, data(BOXES, marks))
     return path
 
 
-def probed(page: Path, folder: Path, fragment: str = "", size: str = "1280,800") -> dict[str, float]:
+def probed(page: Path, folder: Path, fragment: str = "", size: str = "1280,800") -> dict[str, Any]:
     """What the probe finds on the page."""
     copy = folder / "probed.html"
     copy.write_text(page.read_text(encoding="utf-8").replace("</body>", PROBE + "</body>"), encoding="utf-8")
     document, logged, _ = visit(copy, folder, fragment, size)
     found = re.search(r'<pre id="found">(.*?)</pre>', document, re.DOTALL)
     assert found is not None, logged
-    measured: dict[str, float] = json.loads(found[1])
+    measured: dict[str, Any] = json.loads(found[1])
     return measured
 
 
@@ -150,3 +174,78 @@ def test_turning_shows_another_side_and_nonsense_is_ignored(seen: dict[str, dict
 @pytest.mark.parametrize("size", ["1280,800", "820,1180"])
 def test_page_fits_its_window(page: Path, tmp_path: Path, size: str) -> None:
     assert probed(page, tmp_path, size=size)["wide"] <= int(size.split(",")[0])
+
+
+SAYS = "Independent keypoints show the CT's structures elsewhere in the inflated CBCT than the result says."
+"""The longest sentence of a gate."""
+
+
+def ball_page(folder: Path) -> Path:
+    """A page whose lung is a ball of 30 mm of 128 triangles, an octahedron quartered twice."""
+    corners = np.array([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]])
+    faces = np.array([[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]])
+    flat = corners[faces]
+    for _ in range(2):
+        a, b, c = flat[:, 0], flat[:, 1], flat[:, 2]
+        ab, bc, ca = a + b, b + c, c + a
+        quarters = [np.stack(t, axis=1) for t in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))]
+        flat = np.concatenate(quarters)
+        flat /= np.linalg.norm(flat, axis=-1, keepdims=True)
+    points, triangles = np.unique(flat.reshape(-1, 3).round(9), axis=0, return_inverse=True)
+    motion = Motion(triangles.reshape(-1, 3), 30 * points, 30 * points, Surface(40 * CORNERS, TRIANGLES), NODULE)
+    folder.mkdir()
+    write_report(folder / "report.html", data(motion))
+    return folder / "report.html"
+
+
+def test_the_rim_of_the_lung_is_smooth_although_its_mesh_is_coarse(tmp_path: Path) -> None:
+    page = ball_page(tmp_path / "page")
+
+    def sharpest_corner() -> float:
+        """How much the rim turns within 6 degrees beyond a circle's turn: the largest second difference of its radius,
+        as a share of it, each value the mean over 5 degrees, since a pixel is 0.5 % of the radius."""
+        rim = np.array(probed(page, tmp_path)["rim"])
+        radius = np.mean([np.roll(rim / np.median(rim), k) for k in range(-2, 3)], axis=0)
+        return float(np.abs(np.roll(radius, 6) - 2 * radius + np.roll(radius, -6)).max())
+
+    smooth = sharpest_corner()
+    text = page.read_text(encoding="utf-8")
+    assert text.count("const STEPS = 2") == 1
+    page.write_text(text.replace("const STEPS = 2", "const STEPS = 0"), encoding="utf-8")
+    coarse = sharpest_corner()
+    assert smooth < 0.01  # 0.007 where it was made
+    assert coarse > 0.03  # the mesh's own corners, 0.035
+
+
+@pytest.mark.parametrize("hard", [False, True])
+def test_the_report_prints_on_two_a4_pages_that_say_what_matters(hard: bool, tmp_path: Path) -> None:
+    """hard: as much to say as a run ever has, all gates failed and many long warnings."""
+    names = ["overlap", "check", *(f"gate_{n}" for n in range(19))]
+    gates = {name: {"ok": not hard, "value": 0.5, "limit": 0.4, "says": SAYS} for name in names}
+    warnings = [f"Warning {n}: " + "what the reader of a result has to know, " * 6 for n in range(30)] if hard else []
+    write_report(tmp_path / "report.html", data(BOXES, gates=gates, warnings=warnings))
+    pdf = PdfReader(printed(tmp_path / "report.html", tmp_path))
+    assert len(pdf.pages) == 2
+    for sheet in pdf.pages:
+        assert [float(x) for x in sheet.mediabox[2:]] == pytest.approx([595.3, 841.9], abs=1.0)
+    first, second = (" ".join(normalize("NFKC", sheet.extract_text()).split()) for sheet in pdf.pages)
+    trust = "Do not trust it 0 of 21 gates passed" if hard else "Trust it 21 of 21 gates passed"
+    where = "-5.0, 8.0, 4.0 mm, LPS, in the deflated CBCT"
+    for words in (trust, where, "± 8.0 mm holds it with 95 %, widest direction", "9.0 mm below the collapsed lung's"):
+        assert words in first
+    assert ("and 26 more, in report.html and run.json" in first) == hard
+    assert "gate 18" in second
+    assert "A research tool, not a medical device." in second
+    assert len(pdf.pages[0].images) >= 1  # the lung in three dimensions
+    assert len(pdf.pages[1].images) >= 3  # the three planes
+
+
+def test_a_glance_tells_trust_place_sureness_and_depth(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    tiles = re.findall(r'<div class="tile ?(\w*)"><b>(.*?)</b><strong>(.*?)</strong><small>(.*?)</small></div>', text)
+    assert tiles == [
+        ("ok", "trust", "Trust it", "0 of 0 gates passed"),
+        ("", "where", "-5.0, 8.0, 4.0", "mm, LPS, in the deflated CBCT"),
+        ("", "how sure", "± 8.0 mm", "holds it with 95 %, widest direction"),
+        ("", "how deep", "9.0 mm", "below the collapsed lung&#39;s surface"),
+    ]

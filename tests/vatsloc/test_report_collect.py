@@ -32,8 +32,9 @@ def constant(hu):
 @pytest.fixture
 def case():
     hints = Hints()
-    images = constant(-1), constant(-2), constant(-3)
-    return Case(Path("a-case"), "right", *images, Nodule(CT, None), np.array([-1.0, 0, 0]), "air", hints, {}, {})
+    known = Nodule(CT, None), np.array([-1.0, 0, 0]), "air", hints, {}, {}
+    scans = {"cbct_inflated": constant(-2), "cbct_deflated": constant(-3)}
+    return Case(Path("a-case"), "right", constant(-1), *known, **scans)
 
 
 @pytest.fixture

@@ -18,6 +18,7 @@ from vatsloc.formats.meshes import Surface, TetraMesh
 from vatsloc.results import (
     CT_IN_DEFLATED,
     INFLATED_FROM_CT,
+    INPUTS,
     NODULE_MASK,
     OUTPUT_FILES,
     REPORT,
@@ -92,7 +93,7 @@ def result() -> ResultData:
 def test_output_set_is_complete_and_a_result(tmp_path):
     with whole_folder(tmp_path / "out", expected=OUTPUT_FILES) as folder:
         write_results(folder, result())
-        for name in (REPORT, SCENE, SCENE_WITH_SCANS):  # modules of their own write these
+        for name in (INPUTS, REPORT, SCENE, SCENE_WITH_SCANS):  # modules of their own write these
             (folder / name).write_text("<html></html>")
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == sorted(OUTPUT_FILES)
     assert is_result(tmp_path / "out")
@@ -115,7 +116,7 @@ def test_same_data_give_the_same_bytes(tmp_path):
         (tmp_path / name).mkdir()
         write_results(tmp_path / name, result())
     for name in OUTPUT_FILES:
-        if name not in (REPORT, SCENE, SCENE_WITH_SCANS):
+        if name not in (INPUTS, REPORT, SCENE, SCENE_WITH_SCANS):
             assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes()
 
 

@@ -1,4 +1,4 @@
-"""Model selection as a whole: what each step is shown, which model it starts from, and what is left out and why."""
+"""Steps of model selection: what each is shown, which model it starts from, and what is kept."""
 
 from __future__ import annotations
 
@@ -10,95 +10,36 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from poro.collapse import PoroStatus, Theta
-from poro.collapse import StrainMeasure as Strain
-from poro.collapse.choice import StrainChoice
+from poro.collapse import Theta
 from poro.fem import Tissue
 from poro.fit import Fit, FitSettings, FitStatus, Target
 from poro.mesh import TetMesh
-from registration.correspondences import Correspondences
 from registration.volume import Array
-from tests.vatsloc import ball_scene as scene
+from tests.vatsloc.selection_scene import (
+    HILUM,
+    a_fit,
+    a_model,
+    a_surface,
+    knows,
+    mesh,
+    motion,
+    pairs_of,
+)
 from vatsloc.imaging.surface import Border, SurfacePoints
 from vatsloc.workflow import model_selection as module
 from vatsloc.workflow.model_selection import (
     GAIN,
-    NO_CORRESPONDENCES,
-    NO_ENSEMBLE,
     CollapseModel,
     Refinement,
     _regional,
-    _too_few,
     corrected,
     fit_settings,
     held_out,
-    select_model,
     select_refinement,
     surface_target,
+    too_few,
 )
 from vatsloc.workflow.settings import settings_of
-from vatsloc.workflow.stages import Stages
-
-GRAVITY = np.array([1.0, 0.0, 0.0])
-HILUM = np.array([5, 3, 40, 17, 60])
-HILUM_MM = np.arange(15.0).reshape(5, 3)
-
-
-def mesh() -> TetMesh:
-    return scene.placed(scene.lung_mesh(14.0), scene.INF_FROM_CT, scene.DEF_FROM_INF)
-
-
-def motion(points: Array) -> Array:
-    return np.asarray(scene.collapsed(points) - points)
-
-
-def pairs_of(count: int = 400, seed: int = 5) -> Correspondences:
-    """Keypoints that move by the scene's collapse."""
-    x = scene.CENTRE_DEF + np.random.default_rng(seed).uniform(-19, 19, (count, 3))
-    # Far enough from each other that some blocks of 40 mm are held out and others are not.
-    return Correspondences.of(scene.collapsed(x), x)
-
-
-def a_fit(displacement: Array, settled: bool = True, tets: int = 1, inverted: float = 0.0) -> Any:
-    det = np.where(np.arange(tets) < inverted * tets, -1.0, 1.0)
-    state = SimpleNamespace(u=displacement, det_f=det, status=PoroStatus.SOLVED)
-    if not settled:
-        state.status = PoroStatus.NOT_CONVERGED
-    return _Fit(Theta(1e-7, 0.6, 3.0), state)
-
-
-@dataclass(frozen=True)
-class _Fit:
-    """What model selection reads of a fit."""
-
-    theta: Theta
-    state: Any
-    status: FitStatus = FitStatus.CONVERGED
-
-
-def a_model(
-    share: float = 0.0, pairs: Correspondences | None = None, refinements: tuple[Refinement, ...] = ()
-) -> CollapseModel:
-    """A model that knows a share of the collapse."""
-    lung: Any = mesh()
-    system: Any = SimpleNamespace(mesh=lung, gravity=GRAVITY, hilum=HILUM, tissue=None)
-    u = share * motion(lung.points)
-    nothing: Any = None
-    return CollapseModel(system, a_fit(u), u, pairs_of() if pairs is None else pairs, refinements, nothing, NO_ENSEMBLE)
-
-
-def knows(share: float, **change: Any) -> Any:
-    """A step to a model that knows a share of the collapse."""
-
-    def step(model: CollapseModel, target: Target, start: Fit) -> CollapseModel:
-        return replace(model, displacement=share * motion(model.system.mesh.points), **change)
-
-    return step
-
-
-def a_surface() -> Target:
-    found = scene.air_surface(30)
-    return Target(found.points, found.normals, found.confidence)
 
 
 def test_held_out_keypoints_are_never_shown_to_the_model_that_is_judged_by_them() -> None:
@@ -183,14 +124,14 @@ def test_refinements_add_up_and_the_last_one_kept_says_what_remains() -> None:
 
 
 def test_too_few_or_too_crowded_keypoints_judge_nothing() -> None:
-    assert _too_few(pairs_of()) is None
-    assert _too_few(pairs_of(39)) == "only 39 keypoints were matched inside the lung"
+    assert too_few(pairs_of()) is None
+    assert too_few(pairs_of(39)) == "only 39 keypoints were matched inside the lung"
     many = pairs_of(2000)
     hidden, shown = np.flatnonzero(held_out(many.fixed)), np.flatnonzero(~held_out(many.fixed))
     for h, s in ((10, 30), (40, 10)):
-        assert _too_few(many.only(np.concatenate([hidden[:h], shown[:s]]))) is None
+        assert too_few(many.only(np.concatenate([hidden[:h], shown[:s]]))) is None
     for h, s in ((9, 31), (41, 9)):
-        assert "too close together" in str(_too_few(many.only(np.concatenate([hidden[:h], shown[:s]]))))
+        assert "too close together" in str(too_few(many.only(np.concatenate([hidden[:h], shown[:s]]))))
 
 
 def test_every_border_but_a_fissure_is_a_target_with_its_own_confidence_and_normal() -> None:
@@ -283,109 +224,3 @@ def test_the_regional_fit_sets_stretches_and_hilum_free_and_starts_where_it_is_t
     assert found.system is system
     assert found.fit is answer
     assert_array_equal(found.displacement, answer.state.u)
-
-
-class Selection:
-    """`select_model` with a plain fit that knows 20 % of the collapse, and corrections that know all of it when shown
-    all.
-    """
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, pairs: Correspondences) -> None:
-        lung = mesh()
-        self.plain = a_fit(0.1 * motion(lung.points))
-        self.solid = a_fit(0.2 * motion(lung.points)).state
-        self.asked: dict[str, tuple[Any, ...]] = {}
-        self.stages = Stages()
-        self.observed: Any = SimpleNamespace(
-            model_mesh=lung,
-            hilum_nodes=HILUM,
-            motion=SimpleNamespace(displacement=HILUM_MM),
-            surface=scene.air_surface(30),
-        )
-        self.others = np.full((4, *lung.points.shape), 2.0)
-        system = SimpleNamespace(mesh=lung, gravity=GRAVITY, hilum=HILUM)
-        chosen = StrainChoice(self.solid, Strain.FINITE, "because", 0.01, None)
-        for name, answer in (
-            ("assemble", system),
-            ("fit_collapse", self.plain),
-            ("keep_in_range", chosen),
-            ("find_correspondences", pairs),
-            ("perturbation_ensemble", self.others),
-        ):
-            monkeypatch.setattr(module, name, self._asked(name, answer))
-        whole = len(pairs)
-
-        def corrected(_strain: float, data: FitSettings) -> Any:
-            assert data == fit_settings(self.settings)
-            return lambda m, t, s: knows(1.0 if len(t.inflated) == whole else 0.7)(m, t, s)
-
-        monkeypatch.setattr(module, "corrected", corrected)
-
-    def _asked(self, name: str, answer: Any) -> Any:
-        def ask(*values: Any, **named: Any) -> Any:
-            self.asked[name] = (*values, *named.values())
-            return answer
-
-        return ask
-
-    def run(self, **tables: Any) -> CollapseModel:
-        tables = {"model": {"regional": False}, **tables}
-        self.settings = settings_of("balanced", tables)
-        self.prepared: Any = object()
-        return select_model(GRAVITY, self.prepared, self.observed, self.settings, self.stages)
-
-
-def test_the_plain_fit_is_made_of_what_was_observed(monkeypatch: pytest.MonkeyPatch) -> None:
-    known = Selection(monkeypatch, pairs_of())
-    known.run()
-    lung, _, gravity, hilum, hilum_mm = known.asked["assemble"]
-    assert lung is known.observed.model_mesh
-    assert_array_equal(gravity, GRAVITY)
-    assert_array_equal(hilum, HILUM)
-    assert_array_equal(hilum_mm, HILUM_MM)
-    assert_array_equal(known.asked["fit_collapse"][1].points, known.observed.surface.points)
-    assert known.asked["fit_collapse"][2] == fit_settings(known.settings)
-    assert known.asked["keep_in_range"][1] is known.plain.state
-    (choice,) = known.stages.choices
-    assert (choice.part, choice.kept, choice.value, choice.limit) == ("finite strain", True, 0.01, 0.001)
-
-
-def test_keypoints_are_matched_where_the_strain_measure_that_holds_puts_them(monkeypatch: pytest.MonkeyPatch) -> None:
-    known = Selection(monkeypatch, pairs_of())
-    model = known.run()
-    prepared, observed, displacement, settings = known.asked["find_correspondences"]
-    assert prepared is known.prepared
-    assert observed is known.observed
-    assert_array_equal(displacement, known.solid.u)
-    assert settings == known.settings.keypoints
-    lung = known.observed.model_mesh.points
-    assert_allclose(model.displacement, motion(lung))
-    assert_allclose(model.ensemble, -0.3 * motion(lung)[None], atol=1e-12)
-    assert "perturbation_ensemble" not in known.asked
-    assert [refinement.name for refinement in model.refinements] == [
-        f"elastic correction, strain {s:g}" for s in (0.05, 0.025, 0.0125)
-    ]
-    assert sum(refinement.kept for refinement in model.refinements) == 1
-
-
-@pytest.mark.parametrize(
-    ("pairs", "tables", "skipped"),
-    [
-        (pairs_of(), {"keypoints": {"on": False}}, {"keypoints": "switched off in the settings"}),
-        (pairs_of(20), {}, {"regional fit": "only 20 keypoints were matched inside the lung"}),
-        (pairs_of(), {"model": {"regional": False, "correct": False}}, {}),
-    ],
-)
-def test_without_a_refinement_the_plain_fit_stands_and_the_ensemble_says_how_sure_it_is(
-    monkeypatch: pytest.MonkeyPatch, pairs: Correspondences, tables: dict[str, Any], skipped: dict[str, str]
-) -> None:
-    known = Selection(monkeypatch, pairs)
-    model = known.run(**tables)
-    assert_array_equal(model.displacement, known.solid.u)
-    assert model.fit.state is known.solid
-    assert model.refinements == ()
-    assert known.stages.skipped == skipped
-    assert_array_equal(model.ensemble, known.others)
-    assert known.asked["perturbation_ensemble"][2] is known.plain
-    assert len(model.correspondences) == (0 if "keypoints" in skipped else len(pairs))
-    assert len(NO_CORRESPONDENCES) == 0

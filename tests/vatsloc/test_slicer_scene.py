@@ -120,6 +120,17 @@ def test_the_inflated_scan_is_carried_to_the_deflated_one_in_ras(written: tuple[
     assert_allclose(read_points(folder / NODULE_DEFLATED).ras[0], data.nodule_deflated_ras)
 
 
+def test_of_the_surfaces_the_inflated_lung_alone_is_hidden(written: tuple[Path, ResultData]) -> None:
+    scene = nodes(written[0] / SCENE)
+    shown = {name: named(scene, f"{name} display") for name in ("deflated lung", "chest wall", "inflated lung")}
+    seen = {name: (d.get("visibility"), d.get("visibility2D"), d.get("opacity")) for name, d in shown.items()}
+    assert seen == {
+        "deflated lung": ("true", "true", "0.4"),
+        "chest wall": ("true", "true", "0.15"),
+        "inflated lung": ("false", "false", "0.3"),
+    }
+
+
 def test_frames_are_concatenated_by_value_and_sign(tmp_path: Path) -> None:
     """A quarter turn about S after a shift to the right: (0, 0, 0) goes to (10, 0, 0) and then to (0, 10, 0)."""
     turn, shift = np.eye(4), np.eye(4)

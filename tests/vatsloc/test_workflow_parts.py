@@ -128,6 +128,18 @@ def test_settings_file_overrides_the_preset_and_nothing_else(tmp_path: Path) -> 
         load_settings("fast", file)
 
 
+@pytest.mark.parametrize("preset", ["fast", "balanced", "accurate", "auto"])
+def test_every_preset_has_all_parts_switched_on(preset: str) -> None:
+    tables = load_settings(preset, None).model_dump()
+    switches = {f"{name}.{key}": value for name, table in tables.items() for key, value in table.items()}
+    switches = {name: value for name, value in switches.items() if isinstance(value, bool)}
+    assert set(switches) == {
+        *("registration.on", "keypoints.on", "residual.on"),
+        *("model.hilum", "model.diaphragm", "model.regional", "model.correct"),
+    }
+    assert all(switches.values())
+
+
 def test_hand_placed_points_look_away_from_the_lung() -> None:
     corners = np.array([[0.0, 0, 0], [10, 0, 0], [0, 10, 0], [0, 0, 10]])
     faces = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])

@@ -98,6 +98,8 @@ def read_truth(case: Path) -> Truth:
         ("inflated", images.cbct_inflated, known.cbct_inflated),
         ("deflated", images.cbct_deflated, known.cbct_deflated),
     ):
+        if file is None:
+            continue
         volume = read_volume(case / file, images.series(f"cbct_{image}"))
         if points is not None:
             _check_extent(points, file)
@@ -192,7 +194,10 @@ def _check_record(run: dict[str, Any]) -> None:
 def check_same_case(case: Path, folder: Path, run: dict[str, Any]) -> None:
     """Raise CaseError when the result was made from another deflated CBCT than the case holds."""
     made_from = run.get("input_sha256", {}).get("cbct_deflated")
-    image = case / read_case_file(case).images.cbct_deflated
+    name = read_case_file(case).images.cbct_deflated
+    if name is None:
+        raise CaseError(f"{case / 'case.toml'}: [images] cbct_deflated is missing; add it.")
+    image = case / name
     if made_from is not None and sha256(image) != made_from:
         raise CaseError(f"{folder} was made from another image than {image}; give the case that belongs to the result.")
 

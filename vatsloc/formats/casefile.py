@@ -60,12 +60,15 @@ class _Table(BaseModel):
 
 
 class ImageFiles(_Table):
-    """Paths relative to the case folder. *_series: UID, number or description of the series to take in a DICOM folder
-    that holds several; HU = slope x value + intercept where an image is not in HU."""
+    """Paths relative to the case folder; a cone-beam CT that is not taken yet may be left out.
+
+    *_series: UID, number or description of the series to take in a DICOM folder that holds several; HU = slope x value
+    + intercept where an image is not in HU.
+    """
 
     ct: FileName
-    cbct_inflated: FileName
-    cbct_deflated: FileName
+    cbct_inflated: FileName | None = None
+    cbct_deflated: FileName | None = None
     ct_series: SeriesName | None = None
     cbct_inflated_series: SeriesName | None = None
     cbct_deflated_series: SeriesName | None = None

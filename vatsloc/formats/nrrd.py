@@ -60,7 +60,7 @@ def read_nrrd(path: Path) -> RawImage:
         check_affine(affine, path)
         by_axis = spacings[spatial] if spacings.shape == spatial.shape else np.full(3, np.nan)
         check_voxel_size(by_axis, affine, values.shape, "spacings", path)
-    return RawImage(values, affine, path, _segments(header))
+    return RawImage(values, affine, path, _segments(header, path))
 
 
 def nrrd_data_file(path: Path) -> Path:
@@ -103,11 +103,14 @@ def _signs_to_ras(header: Mapping[str, Any], path: Path) -> tuple[int, int, int]
     return _SIGNS_TO_RAS[name]
 
 
-def _segments(header: Mapping[str, Any]) -> tuple[Segment, ...]:
-    """Segments of a Slicer segmentation; where none has a value, as in Slicer 4.10, each is a layer of its own."""
+def _segments(header: Mapping[str, Any], path: Path) -> tuple[Segment, ...]:
+    """Segments of a Slicer segmentation; where none has a value, as in Slicer 4.10, each is a layer of its own.
+
+    Raises InputRefused where two have the same value in one layer, so that their voxels cannot be told apart.
+    """
     numbers = sorted({int(found[1]) for key in header if (found := re.fullmatch(r"Segment(\d+)_\w+", key))})
     stated = any(f"Segment{n}_LabelValue" in header for n in numbers)
-    return tuple(
+    segments = tuple(
         Segment(
             label=int(header[f"Segment{n}_LabelValue"]) if stated else 1,
             name=str(header.get(f"Segment{n}_Name", "")),
@@ -115,6 +118,15 @@ def _segments(header: Mapping[str, Any]) -> tuple[Segment, ...]:
         )
         for n in numbers
     )
+    names: dict[tuple[int, int], str] = {}
+    for segment in segments:
+        other = names.setdefault((segment.layer, segment.label), segment.name)
+        if other != segment.name:
+            raise InputRefused(
+                f'{path} gives segments "{other}" and "{segment.name}" the same value {segment.label} in one layer; '
+                "export the segmentation again."
+            )
+    return segments
 
 
 def _affine(directions: Array, origin: Array, signs: tuple[int, int, int]) -> Array:

@@ -68,7 +68,7 @@ def pleural_gas(
     inflated: PreparedCbct, deflated: PreparedCbct, spine_inflated: Spine, spine_deflated: Spine
 ) -> PleuralGas:
     """Gas beside the lungs before and after the collapse, parted by the spine."""
-    return PleuralGas(_gas_ml(inflated, spine_inflated), _gas_ml(deflated, spine_deflated))
+    return PleuralGas(gas_ml(inflated, spine_inflated), gas_ml(deflated, spine_deflated))
 
 
 def nodule_side(ct: Volume, nodule: Mask | None, nodule_ras: Array | None) -> Side | None:
@@ -92,7 +92,7 @@ def nodule_side(ct: Volume, nodule: Mask | None, nodule_ras: Array | None) -> Si
     return nearest if clear else None
 
 
-def _gas_ml(cbct: PreparedCbct, spine: Spine) -> dict[Side, float]:
+def gas_ml(cbct: PreparedCbct, spine: Spine) -> dict[Side, float]:
     """Thick dark regions that no axial slice joins to the rim of the field of view, on either side of the spine."""
     work = working_copy(cbct.volume, SPACING_MM)
     spacing = work.grid.spacing

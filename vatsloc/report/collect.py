@@ -12,6 +12,7 @@ from vatsloc.formats.meshes import Surface, TetraMesh
 from vatsloc.frames import flip_points
 from vatsloc.report.data import LUNG, MESH, Comparison, Motion, Nodule, Outline, Picture, ReportData
 from vatsloc.report.landmarks import depth_below, surface_landmarks
+from vatsloc.report.words import WORDS
 from vatsloc.results import ResultData, RunRecord
 
 
@@ -25,44 +26,44 @@ def report_data(case: Case, result: ResultData, pictures: tuple[Picture, ...] = 
     nodule = Nodule(result.nodule_deflated_ras, _ellipsoid(result.run))
     phases = (
         Comparison(
-            title="Phase 1: change of pose",
-            fixed_name="inflated CBCT",
+            title=WORDS["phase1"],
+            fixed_name=WORDS["inflated_cbct"],
             fixed=case.cbct_inflated,
-            before_name="CT",
+            before_name=WORDS["ct"],
             before=case.ct,
             before_from_fixed=RigidTransform(result.rigid_inflated_from_ct).inverse(),
-            after_name="warped CT",
+            after_name=WORDS["warped_ct"],
             after=result.ct_in_inflated,
             nodule=Nodule(result.nodule_inflated_ras),
-            outlines=(Outline("lung model", LUNG, inflated),),
+            outlines=(Outline(WORDS["lung_model"], LUNG, inflated),),
         ),
         Comparison(
-            title="Phase 2: pneumothorax",
-            fixed_name="deflated CBCT",
+            title=WORDS["phase2"],
+            fixed_name=WORDS["deflated_cbct"],
             fixed=case.cbct_deflated,
-            before_name="inflated CBCT",
+            before_name=WORDS["inflated_cbct"],
             before=case.cbct_inflated,
             before_from_fixed=RigidTransform(result.rigid_deflated_from_inflated).inverse(),
-            after_name="warped CT",
+            after_name=WORDS["warped_ct"],
             after=result.ct_in_deflated,
             nodule=nodule,
-            outlines=(Outline("lung model", LUNG, deflated),),
+            outlines=(Outline(WORDS["lung_model"], LUNG, deflated),),
         ),
     )
     own = (
         Picture(
-            "Lung model in the CT",
-            "Tetrahedra that fill the segmented lung; planes through the nodule.",
+            WORDS["model_in_ct"],
+            WORDS["model_in_ct_says"],
             case.ct,
             case.nodule.centre_ras,
-            (Outline("lung model", LUNG, _outer(result.lung_ct)),),
+            (Outline(WORDS["lung_model"], LUNG, _outer(result.lung_ct)),),
         ),
         Picture(
-            "Contact surface in the deflated CBCT",
-            "What the collapsing lung may not pass.",
+            WORDS["contact"],
+            WORDS["contact_says"],
             case.cbct_deflated,
             result.nodule_deflated_ras,
-            (Outline("contact surface", MESH, result.contact_surface),),
+            (Outline(WORDS["contact_surface"], MESH, result.contact_surface),),
         ),
     )
     depth, nearest = depth_below(result.deflated_surface, result.nodule_deflated_ras)

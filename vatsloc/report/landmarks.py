@@ -8,6 +8,7 @@ from poro.mesh import TriSurface, closest_points
 from registration.volume import Array
 from vatsloc.formats.meshes import Surface
 from vatsloc.report.data import Landmark
+from vatsloc.report.words import WORDS
 
 GAS_MM = 5.0
 """Pleural gas between lung and cage that makes a place visible."""
@@ -33,10 +34,10 @@ def surface_landmarks(lung: Surface, cage: Surface, foot_ras: Array) -> tuple[La
     level = points[np.abs(points[:, 2] - foot_ras[2]) < BAND_MM]
     level = level if len(level) else points
     at = {
-        "apex": points[points[:, 2].argmax()],
-        "lowest edge": points[points[:, 2].argmin()],
-        "anterior edge at that height": level[level[:, 1].argmax()],
-        "posterior edge at that height": level[level[:, 1].argmin()],
+        WORDS["apex"]: points[points[:, 2].argmax()],
+        WORDS["lowest"]: points[points[:, 2].argmin()],
+        WORDS["anterior"]: level[level[:, 1].argmax()],
+        WORDS["posterior"]: level[level[:, 1].argmin()],
     }
     gas_mm = np.abs(closest_points(_tri(cage), np.array(list(at.values()))).distance)
     marks = [
@@ -51,7 +52,7 @@ def moved_by(before_ras: Array, after_ras: Array) -> str:
     ways = (("right", "left"), ("front", "back"), ("head", "feet"))
     step = np.asarray(after_ras) - np.asarray(before_ras)
     parts = [
-        f"{abs(step[axis]):.0f} to the {ways[axis][int(step[axis] < 0)]}"
+        WORDS["moved_to"].format(mm=abs(step[axis]), way=WORDS[ways[axis][int(step[axis] < 0)]])
         for axis in np.argsort(-np.abs(step))
         if abs(step[axis]) >= 0.5
     ]

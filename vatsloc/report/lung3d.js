@@ -1,8 +1,11 @@
 "use strict";
 // The lung in three dimensions, drawn by a rasterizer of its own: it needs no graphics card and looks alike everywhere.
+const STEPS = 2, FINEST = 120000; // subdivisions at most, triangles at most
 function lung3d(canvas, scene) {
   const pen = canvas.getContext("2d");
-  const { triangles, before, after, cage, nodule } = scene;
+  const { cage, nodule } = scene;
+  // The mesh is coarse, its rim a polygon: a smooth surface is drawn through it.
+  const { triangles, values: [before, after] } = smooth(scene.triangles, [scene.before, scene.after]);
   const now = new Float32Array(before.length);
   const lung = mesh(now, triangles), wall = mesh(cage.points, cage.triangles), ball = sphere();
   const ORANGE = [230, 159, 0], YELLOW = [240, 228, 66], BLUE = [86, 180, 233], GREY = [190, 200, 215];
@@ -16,6 +19,43 @@ function lung3d(canvas, scene) {
   for (let a = 0; a < 3; a++) middle[a] = (low[a] + high[a]) / 2;
   const radius = Math.hypot(...middle.map((m, a) => high[a] - m));
 
+  // Loop's subdivision (1987) of a closed surface, the same for every array of points.
+  function smooth(corners, values) {
+    for (let n = 0; n < STEPS && 4 * corners.length <= 3 * FINEST; n++) [corners, values] = subdivided(corners, values);
+    return { triangles: corners, values };
+  }
+  function subdivided(corners, values) {
+    const n = values[0].length / 3, edges = new Map(), across = [], ends = [];
+    const sum = values.map((v) => new Float64Array(v.length)), degree = new Uint16Array(n);
+    const edge = (a, b, opposite) => {
+      const key = a < b ? a * n + b : b * n + a;
+      let e = edges.get(key);
+      if (e === undefined) { e = ends.length; edges.set(key, e); ends.push([a, b]); across.push([]); }
+      across[e].push(opposite);
+      return n + e;
+    };
+    const finer = new Uint32Array(4 * corners.length);
+    for (let t = 0; t < corners.length; t += 3) {
+      const [a, b, c] = corners.subarray(t, t + 3), ab = edge(a, b, c), bc = edge(b, c, a), ca = edge(c, a, b);
+      finer.set([a, ab, ca, ab, b, bc, ca, bc, c, ab, bc, ca], 4 * t);
+    }
+    for (const [a, b] of ends) {
+      degree[a]++; degree[b]++;
+      values.forEach((v, m) => { for (let x = 0; x < 3; x++) { sum[m][3 * a + x] += v[3 * b + x]; sum[m][3 * b + x] += v[3 * a + x]; } });
+    }
+    return [finer, values.map((v, m) => {
+      const out = new Float32Array(3 * (n + ends.length));
+      for (let p = 0; p < n; p++) {
+        const k = Math.max(degree[p], 1), beta = (5 / 8 - (3 / 8 + Math.cos((2 * Math.PI) / k) / 4) ** 2) / k;
+        for (let x = 0; x < 3; x++) out[3 * p + x] = (1 - k * beta) * v[3 * p + x] + beta * sum[m][3 * p + x];
+      }
+      ends.forEach(([a, b], e) => { for (let x = 0; x < 3; x++) {
+        const middle = v[3 * a + x] + v[3 * b + x], [c, d] = across[e];
+        out[3 * (n + e) + x] = d === undefined ? middle / 2 : (3 * middle + v[3 * c + x] + v[3 * d + x]) / 8;
+      } });
+      return out;
+    })];
+  }
   function mesh(points, corners) {
     return { points, corners, normals: new Float32Array(points.length), screen: new Float32Array(points.length),
              facing: new Float32Array(points.length / 3), light: new Float32Array(points.length / 3) };
@@ -106,8 +146,9 @@ function lung3d(canvas, scene) {
   const mix = (p, q, share) => p.map((x, a) => x + share * (q[a] - x));
 
   normalsOf(wall);
-  return function draw({ deform, turn, tilt }) {
-    const fine = Math.min(window.devicePixelRatio || 1, 2);
+  // coarse: while the view moves; else two pixels for each on the screen, so that rims are not jagged.
+  return function draw({ deform, turn, tilt }, coarse) {
+    const fine = coarse ? Math.min(window.devicePixelRatio || 1, 2) : 2;
     const width = (canvas.width = Math.round(canvas.clientWidth * fine)), height = (canvas.height = Math.round(canvas.clientHeight * fine));
     if (!width || !height) return;
     for (let n = 0; n < now.length; n++) now[n] = before[n] + deform * (after[n] - before[n]);
@@ -165,11 +206,11 @@ function lung3d(canvas, scene) {
       for (const { name, at } of scene.landmarks) {
         const p = view.project(at);
         pen.beginPath(); pen.arc(p[0], p[1], 3 * fine, 0, 7); pen.fill();
-        write(name.split(" at ")[0], p, 7, 0);
+        write(name, p, 7, 0);
       }
     }
-    if (Math.hypot(first[0] - last[0], first[1] - last[1]) > 40 * fine) write("inflated", first, 11, 0);
-    write("nodule", last, 11, last[1] > first[1] ? 16 : -16);
+    if (Math.hypot(first[0] - last[0], first[1] - last[1]) > 40 * fine) write(scene.words.inflated, first, 11, 0);
+    write(scene.words.nodule, last, 11, last[1] > first[1] ? 16 : -16);
     const corner = [34 * fine, canvas.height - 34 * fine];
     for (const [axis, letter, opposite] of [[0, "R", "L"], [1, "A", "P"], [2, "S", "I"]]) {
       const dx = view.right[axis], dy = -view.up[axis], long = 20 * fine;

@@ -21,18 +21,21 @@ from vatsloc.report.paint import as_bgr, draw_nodule, draw_outline, green_magent
 from vatsloc.report.planes import AXES, EDGE_LETTERS, Plane, box_of, plane_through, sample
 from vatsloc.report.stack import stacks
 from vatsloc.report.view3d import scene
+from vatsloc.report.words import WORDS
 
 STILL_PIXELS = 480
+PAPER_WARNINGS = 4
+"""How many warnings are printed; `report.css` hides the others on paper, so that two pages do."""
 
 SCORES_FROM, SCORES_TO = "<!-- scores: evaluate writes here -->", "<!-- end of scores -->"
 
 MEASURE_NAMES = {
-    "rigid_ct_inflated": "rigid: CT to inflated",
-    "phase1": "phase 1: CT to inflated",
-    "rigid_ct_deflated": "rigid: CT to deflated",
-    "rigid_inflated_deflated": "rigid: inflated to deflated",
-    "phase2": "phase 2: inflated to deflated",
-    "chain": "whole chain: CT to deflated",
+    "rigid_ct_inflated": WORDS["rigid_ct_inflated"],
+    "phase1": WORDS["score_phase1"],
+    "rigid_ct_deflated": WORDS["rigid_ct_deflated"],
+    "rigid_inflated_deflated": WORDS["rigid_inflated_deflated"],
+    "phase2": WORDS["score_phase2"],
+    "chain": WORDS["score_chain"],
 }
 
 # Keys of run.json that have a place of their own on the page; whatever else a run recorded is listed at its end.
@@ -71,7 +74,7 @@ def render(data: ReportData) -> str:
     seconds = data.run.get("seconds", {})
     stages = {name: float(s) for name, s in seconds.items() if name != "total"}
     chosen = {choice["part"] for choice in data.run.get("choices", ())}
-    memory = data.run.get("peak_mb_by_stage") or {"whole run": data.run.get("peak_mb")}
+    memory = data.run.get("peak_mb_by_stage") or {WORDS["whole_run"]: data.run.get("peak_mb")}
     memory = {name: float(mb) for name, mb in memory.items() if mb is not None}
     return _page("report.html").render(
         data=data,
@@ -90,11 +93,12 @@ def render(data: ReportData) -> str:
         mark=next((mark for mark in data.landmarks if mark.visible), None),
         phases=[(phase, _before_after(phase, data.window_hu)) for phase in data.phases],
         pictures=[(picture, _views(picture, data.window_hu)) for picture in data.pictures],
-        seconds_chart=bars(stages, "s", "seconds per stage") if stages else None,
-        memory_chart=bars(memory, "MB", "highest memory per stage") if memory else None,
+        seconds_chart=bars(stages, "s", WORDS["seconds_alt"]) if stages else None,
+        memory_chart=bars(memory, "MB", WORDS["memory_alt"]) if memory else None,
         rest={k: json.dumps(v, indent=1, default=str) for k, v in data.run.items() if k not in _SHOWN},
         skipped={name: why for name, why in data.run.get("skipped", {}).items() if name not in chosen},
         colours={"nodule": NODULE, "lung": LUNG, "cage": MESH, "inflated": SURFACE},
+        paper_warnings=PAPER_WARNINGS,
         scores_from=Markup(SCORES_FROM),
         scores_to=Markup(SCORES_TO),
     )
@@ -114,9 +118,7 @@ def with_scores(page: str, scores: TreSection) -> str:
     body = _page("scores.html").render(
         summary=scores.summary,
         names=MEASURE_NAMES,
-        chart=box_plot(
-            {MEASURE_NAMES[m]: scores.errors_mm[m] for m in MEASURE_NAMES}, "target registration error per landmark"
-        ),
+        chart=box_plot({MEASURE_NAMES[m]: scores.errors_mm[m] for m in MEASURE_NAMES}, WORDS["tre_alt"]),
     )
     return f"{head}{SCORES_FROM}\n{body}\n{SCORES_TO}{tail}"
 
@@ -126,21 +128,18 @@ def judge(run: Mapping[str, Any]) -> tuple[str, str]:
     failed = [name for name, gate in run.get("gates", {}).items() if not gate["ok"]]
     n_warnings = len(run.get("warnings", []))
     if failed:
-        return (
-            "fail",
-            f"Do not rely on this position: {len(failed)} of {len(run['gates'])} quality gates failed "
-            f"({', '.join(name.replace('_', ' ') for name in failed)}).",
-        )
+        names = ", ".join(name.replace("_", " ") for name in failed)
+        return "fail", WORDS["verdict_fail"].format(failed=len(failed), n=len(run["gates"]), names=names)
     if n_warnings:
-        return "warn", f"Every quality gate passed; {n_warnings} warning{'s' if n_warnings > 1 else ''} to read first."
-    return "ok", "Every quality gate passed, no warnings."
+        return "warn", WORDS["verdict_warning" if n_warnings == 1 else "verdict_warnings"].format(n=n_warnings)
+    return "ok", WORDS["verdict_ok"]
 
 
 def _before_after(phase: Comparison, window: tuple[float, float]) -> list[tuple[str, list[View]]]:
     """Blends before and after, in three planes each, with a heading."""
     rows: list[tuple[str, list[View]]] = [
-        (f"Before: {phase.before_name}, rigid pose alone", []),
-        (f"After: {phase.after_name}", []),
+        (WORDS["before"].format(image=phase.before_name), []),
+        (WORDS["after"].format(image=phase.after_name), []),
     ]
     for plane in _planes(phase.fixed.grid, phase.nodule.centre_ras):
         below = grey(sample(phase.fixed, plane), window)
@@ -150,7 +149,9 @@ def _before_after(phase: Comparison, window: tuple[float, float]) -> list[tuple[
             draw_outline(second, plane, outline)
         for image, (heading, views) in zip((first, second), rows, strict=True):
             draw_nodule(image, plane, phase.nodule)
-            alt = f"{phase.title}. {heading}. {plane.name} plane, in green over {phase.fixed_name} in magenta"
+            alt = WORDS["blend_alt"].format(
+                title=phase.title, heading=heading, plane=WORDS[plane.name], image=phase.fixed_name
+            )
             views.append(_view(image, alt, plane))
     return rows
 
@@ -161,7 +162,7 @@ def _views(picture: Picture, window: tuple[float, float]) -> list[View]:
         image = as_bgr(grey(sample(picture.image, plane), window))
         for outline in picture.outlines:
             draw_outline(image, plane, outline)
-        views.append(_view(image, f"{picture.title}: {plane.name} plane", plane))
+        views.append(_view(image, WORDS["picture_alt"].format(title=picture.title, plane=WORDS[plane.name]), plane))
     return views
 
 
@@ -197,4 +198,5 @@ def _page(name: str) -> jinja2.Template:
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    environment.globals["w"] = WORDS
     return environment.get_template(name)

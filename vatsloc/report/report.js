@@ -13,7 +13,7 @@
   const inWords = (axis, mm) => Math.abs(mm).toFixed(1) + " mm " + letters[axis][mm >= 0 ? 0 : 1];
   const byId = (id) => document.getElementById(id);
   const state = { blend: 0, deform: 100, turn: scene.look.turn, tilt: scene.look.tilt };
-  const space = byId("space"), draw3d = space && lung3d(space, { ...scene.motion, landmarks: scene.landmarks, nodule: scene.nodule });
+  const space = byId("space"), draw3d = space && lung3d(space, { ...scene.motion, landmarks: scene.landmarks, words: scene.words, nodule: scene.nodule });
 
   function decoded(data) {
     const bytes = (text) => Uint8Array.from(atob(text), (c) => c.charCodeAt(0)).buffer;
@@ -108,7 +108,7 @@
     part.slider.value = away.indexOf(Math.min(...away));
     show(part);
   }
-  let waiting = false;
+  let waiting = false, resting = 0;
   function refresh() {
     byId("blend").value = state.blend;
     byId("blend-shown").textContent = state.blend + " %";
@@ -118,9 +118,10 @@
     byId("deform-shown").textContent = state.deform + " %";
     if (waiting) return;
     waiting = true;
-    requestAnimationFrame(() => { waiting = false; paint(); });
+    clearTimeout(resting);
+    requestAnimationFrame(() => { waiting = false; paint(true); resting = setTimeout(paint, 100); });
   }
-  function paint() { if (space) draw3d({ ...state, deform: state.deform / 100 }); }
+  function paint(coarse) { if (space) draw3d({ ...state, deform: state.deform / 100 }, coarse === true); }
   function set(changes) {
     Object.assign(state, changes);
     state.tilt = Math.max(-89, Math.min(89, state.tilt));

@@ -12,10 +12,12 @@ from registration.volume import Array
 from vatsloc.formats.meshes import Surface
 from vatsloc.report.data import LUNG, MESH, NODULE, ReportData
 from vatsloc.report.stack import Stack
+from vatsloc.report.words import WORDS
 
 LOOK_DEGREES = {"right": -60.0, "left": 60.0}
 """Turn from the front towards the operated side: about where a thoracoscope looks from."""
 TILT_DEGREES = 12.0
+_SHORT = {WORDS[name]: WORDS[f"{name}_short"] for name in ("apex", "lowest", "anterior", "posterior")}
 
 
 def scene(data: ReportData, stacks: Sequence[Stack]) -> dict[str, Any]:
@@ -39,7 +41,10 @@ def scene(data: ReportData, stacks: Sequence[Stack]) -> dict[str, Any]:
             "ellipsoid": None if nodule.ellipsoid is None else _rounded(nodule.ellipsoid),
             "foot": None if data.nearest_surface_ras is None else _rounded(data.nearest_surface_ras),
         },
-        "landmarks": [{"name": mark.name, "at": _rounded(mark.at_ras)} for mark in data.landmarks if mark.visible],
+        "landmarks": [
+            {"name": _SHORT[mark.name], "at": _rounded(mark.at_ras)} for mark in data.landmarks if mark.visible
+        ],
+        "words": {name: WORDS[f"mark_{name}"] for name in ("nodule", "inflated")},
     }
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from poro.collapse import PoroStatus
 from poro.fit import FitStatus, ellipsoid95
 from registration.images.resample import coarsen
+from registration.verification import LeftOver
 from registration.volume import Array
 from vatsloc.case import Case
 from vatsloc.errors import NotConverged
@@ -81,14 +82,16 @@ def locate_nodule(
     return Localization(prepared, pose, collapse, nodule_inf, nodule_def, lengths, axes, gates)
 
 
-def checked(case: Case, found: Localization, settings: Settings, stages: Stages) -> Localization:
+def checked(
+    case: Case, found: Localization, settings: Settings, stages: Stages, phase1: LeftOver | None = None
+) -> Localization:
     """The result with the gates of its check by independent keypoints, and with a wider ellipsoid where these show an
-    error that it does not hold.
+    error that it does not hold. phase1: what is left over of the change of pose, where that is known.
     """
     with stages.stage("check"):
         ct, prepared, pose, collapse = coarsen(case.ct, VOXEL_MM), found.prepared, found.pose, found.collapse
         checks = Checks(
-            compare(ct, prepared.inflated, pose.lung_inf, pose.inf_from_ct),
+            phase1 or compare(ct, prepared.inflated, pose.lung_inf, pose.inf_from_ct),
             compare(ct, prepared.deflated, collapse.observed.found.lung, found.def_from_ct),
         )
         here = found.nodule_inf[None], found.nodule_def[None]

@@ -30,15 +30,13 @@ from registration.volume import Array
 from vatsloc.imaging.surface import Border, SurfacePoints
 from vatsloc.workflow.choices import Choice
 from vatsloc.workflow.ensemble import perturbation_ensemble
+from vatsloc.workflow.hold_out import held_out, too_few
 from vatsloc.workflow.keypoints import find_correspondences
 from vatsloc.workflow.observe import Observed
 from vatsloc.workflow.prepare import Prepared
 from vatsloc.workflow.settings import Settings
 from vatsloc.workflow.stages import Stages
 
-BLOCK_MM = 40.0
-"""Keypoints are held out by blocks this wide, because neighbours move nearly alike."""
-LEAST_CORRESPONDENCES = 40
 CORRECTION_STRAINS = (0.05, 0.025, 0.0125)
 MOST_INVERTED = 0.001
 STRAIN = "finite strain"
@@ -124,7 +122,7 @@ def _refined(
     with stages.stage("keypoints"):
         found = find_correspondences(prepared, observed, model.displacement, settings.keypoints)
         model = replace(model, correspondences=found)
-    training_only, why = model, _too_few(model.correspondences)
+    training_only, why = model, too_few(model.correspondences)
     if why:
         stages.skip("regional fit", why)
         return model, model
@@ -168,24 +166,8 @@ def _settled(model: CollapseModel) -> bool:
     return model.fit.status is not FitStatus.CONTACT and model.fit.state.status is not PoroStatus.NOT_CONVERGED
 
 
-def _too_few(found: Correspondences) -> str | None:
-    """Why correspondences cannot judge a refinement; None when they can."""
-    hidden = held_out(found.fixed)
-    if len(found) < LEAST_CORRESPONDENCES:
-        return f"only {len(found)} keypoints were matched inside the lung"
-    if min(hidden.sum(), (~hidden).sum()) < LEAST_CORRESPONDENCES // 4:
-        return "the matched keypoints lie too close together to hold some out"
-    return None
-
-
 NO_CORRESPONDENCES = Correspondences.none()
 NO_ENSEMBLE = np.zeros((0, 0, 3))
-
-
-def held_out(points: Array) -> Array:
-    """A quarter of points (n, 3), by blocks, the same ones in every run, (n,) bool."""
-    block = np.floor(points / BLOCK_MM).astype(int)
-    return np.asarray((block @ np.array([1, 2, 3])) % 4 == 0)
 
 
 def surface_target(surface: SurfacePoints) -> Target:

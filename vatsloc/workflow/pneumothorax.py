@@ -18,25 +18,28 @@ from vatsloc.workflow.model_selection import CollapseModel, select_model
 from vatsloc.workflow.observe import Observed, observe
 from vatsloc.workflow.pose import ChangeOfPose
 from vatsloc.workflow.prepare import Prepared
+from vatsloc.workflow.refinement import BlockRefinement, Compared, Shape, refine_by_blocks
 from vatsloc.workflow.residual import Residual, residual_registration
 from vatsloc.workflow.settings import Settings
 from vatsloc.workflow.stages import Stages
 
 RESIDUAL = "residual registration"
+REFINEMENT = "block refinement, deflated"
 
 
 @dataclass(frozen=True)
 class Collapse:
     """The lung after its collapse, in the deflated CBCT's frame.
 
-    model: what mechanics made of the observations; residual: what images added to it; points_after: (n, 3) mm, nodes of
-    `observed.mesh_before` after both.
+    model: what mechanics made of the observations; residual: what images added to it; refinement: what small blocks of
+    the CT added to that, None where it is off; points_after: (n, 3) mm, nodes of `observed.mesh_before` after all.
     """
 
     observed: Observed
     model: CollapseModel
     residual: Residual | None
     points_after: Array
+    refinement: BlockRefinement | None = None
 
     @property
     def def_from_inf_rigid(self) -> RigidTransform:
@@ -86,27 +89,51 @@ def collapse(
     model = select_model(case.gravity_ras, prepared, observed, settings, stages)
     before = observed.mesh_before
     after = before.points + interpolate(locate(observed.model_mesh, before.points), model.displacement)
+    residual = _residual(prepared, pose, observed, model, after, settings, stages)
+    after = after if residual is None else after + residual.displacement
+    if not settings.refinement.on:
+        stages.skip(REFINEMENT, "switched off in the settings")
+        return Collapse(observed, model, residual, after)
+    with stages.stage(REFINEMENT):
+        to_deflated = MeshMap(pose.mesh_ct, after, observed.def_from_inf_rigid @ pose.inf_from_ct_rigid)
+        refinement = refine_by_blocks(
+            Compared(case.ct, prepared.lung_ct, prepared.deflated, observed.found.lung),
+            Shape(before, to_deflated, np.zeros(0, dtype=int)),
+            settings.refinement,
+        )
+    return Collapse(observed, model, residual, refinement.points, refinement)
+
+
+def _residual(
+    prepared: Prepared,
+    pose: ChangeOfPose,
+    observed: Observed,
+    model: CollapseModel,
+    after: Array,
+    settings: Settings,
+    stages: Stages,
+) -> Residual | None:
+    """What the images add to the model's nodes (n, 3) mm; None where they are not asked, or show too little."""
     if not settings.residual.on:
         stages.skip(RESIDUAL, "switched off in the settings")
-        return Collapse(observed, model, None, after)
+        return None
     misfit_mm = np.inf if model.held_out_mm is None else model.held_out_mm
     seen = f"the model misses held-out keypoints by {misfit_mm:.2f} mm (median)"
     if not stages.choose(weigh(RESIDUAL, misfit_mm, settings.leave_out.residual_mm, seen)):
-        return Collapse(observed, model, None, after)
+        return None
     rigid, chosen = observed.def_from_inf_rigid, settings.residual
     if any(refinement.kept for refinement in model.refinements):
         chosen = chosen.model_copy(update={"levels": max(chosen.levels - 1, 1)})
     with stages.stage(RESIDUAL):
-        residual = residual_registration(
+        return residual_registration(
             prepared,
             observed.found.lung,
             MeshMap(pose.mesh_inf, after, rigid),
-            before,
+            observed.mesh_before,
             observed.surface,
             chosen,
             model.correspondences.mapped(moving=rigid.inverse()),
         )
-    return Collapse(observed, model, residual, after if residual is None else after + residual.displacement)
 
 
 def contact_surface(collapse: Collapse) -> TriSurface:

@@ -18,12 +18,13 @@ from registration.maps.rigid import RigidTransform
 from registration.sliding import SlidingFit, register_sliding
 from registration.spine import RigidFit, SpineSearch, register_spine
 from registration.volume import Array, Mask
-from vatsloc.case import Case
+from vatsloc.case import CaseBefore
 from vatsloc.imaging.lungs import Side
 from vatsloc.imaging.thorax import carry_prior, inflated_lung, require_share, visible_share
 from vatsloc.maps import MeshMap
 from vatsloc.workflow.choices import Choice, weigh
-from vatsloc.workflow.prepare import Prepared
+from vatsloc.workflow.prepare import PreparedBefore
+from vatsloc.workflow.refinement import BlockRefinement, Compared, Shape, refine_by_blocks
 from vatsloc.workflow.settings import RegistrationSettings, Settings
 from vatsloc.workflow.stages import CT, INFLATED, Stages
 
@@ -50,9 +51,9 @@ Register = Callable[..., FfdFit]
 class ChangeOfPose:
     """The lung before its collapse. mesh_ct, points_inf: the same nodes in the CT and in the inflated CBCT, mm.
 
-    ffd, its inversion at the nodes: None where the lung was left to the spine alone; extrapolation: None there too;
-    seen: (n,) nodes that the scanner saw; lung_inf: lung mask in the CBCT; overlap: share of the
-    lung in its field of view.
+    ffd, its inversion at the nodes: None where the lung was left to the spine alone; extrapolation: None there too, and
+    what it left before the refinement; seen: (n,) nodes that the scanner saw; lung_inf: lung mask in the CBCT; overlap:
+    share of the lung in its field of view; refinement: what blocks near the pleura added, None where it is off.
     """
 
     rigid: RigidFit
@@ -64,6 +65,7 @@ class ChangeOfPose:
     inversion: Inversion | None
     extrapolation: Extrapolation | None
     overlap: float
+    refinement: BlockRefinement | None = None
 
     @property
     def inf_from_ct_rigid(self) -> RigidTransform:
@@ -82,7 +84,11 @@ class ChangeOfPose:
 
 
 def change_of_pose(
-    case: Case, prepared: Prepared, settings: Settings, stages: Stages, register: Register = register_sliding
+    case: CaseBefore,
+    prepared: PreparedBefore,
+    settings: Settings,
+    stages: Stages,
+    register: Register = register_sliding,
 ) -> ChangeOfPose:
     """Register the CT to the inflated CBCT and continue the motion to the whole lung."""
     hinted = _hinted(case)
@@ -108,7 +114,7 @@ def change_of_pose(
     if not settings.registration.on:
         stages.skip("free-form deformation", "switched off in the settings")
         nowhere = np.zeros(len(mesh.points), dtype=bool)
-        return ChangeOfPose(rigid, None, lung_inf, mesh, placed.points, nowhere, None, None, overlap)
+        return ChangeOfPose(rigid, None, lung_inf, mesh, placed.points, nowhere, None, None, overlap, None)
     with stages.stage("free-form deformation"):
         ffd = register(
             prepared.inflated.volume,
@@ -128,16 +134,29 @@ def change_of_pose(
         settled = inversion.residual_mm < settings.gates.max_inversion_mm
         seen = _deep_inside(prepared.inflated.field.usable, inversion.points_fixed) & settled
         extension = continued(mesh, placed, inversion.points_fixed, seen, settled)
+    points, refinement = placed.points + extension.u, None
+    if settings.refinement.on:
+        with stages.stage("block refinement, inflated"):
+            to_inflated = MeshMap(mesh, points, inf_from_ct_rigid)
+            refinement = refine_by_blocks(
+                Compared(case.ct, prepared.lung_ct, prepared.inflated, lung_inf),
+                Shape(placed, to_inflated, np.flatnonzero(seen & (depth_of_nodes(mesh) > DEEP_MM)), DEEP_MM),
+                settings.refinement,
+            )
+        points = refinement.points
+    else:
+        stages.skip("block refinement, inflated", "switched off in the settings")
     return ChangeOfPose(
         rigid=rigid,
         ffd=ffd,
         lung_inf=lung_inf,
         mesh_ct=mesh,
-        points_inf=placed.points + extension.u,
+        points_inf=points,
         seen=seen,
         inversion=inversion,
         extrapolation=extension,
         overlap=overlap,
+        refinement=refinement,
     )
 
 
@@ -156,7 +175,7 @@ def continued(mesh: TetMesh, placed: TetMesh, points: Array, seen: Array, settle
     nodes; seen, settled: (n,) bool, in view; inverted. The elastic lung is first laid out by the best quadratic map of
     the nodes that are believed in full, since linear elasticity loses large rotations and strains.
     """
-    depth = -closest_points(mesh.boundary, mesh.points).distance
+    depth = depth_of_nodes(mesh)
     deep = np.clip((depth - SHALLOW_MM) / (DEEP_MM - SHALLOW_MM), 0, 1)
     told = SHALLOW * (SEEN / SHALLOW) ** deep
     weights = np.where(seen, told, np.minimum(told, UNSEEN))
@@ -165,6 +184,11 @@ def continued(mesh: TetMesh, placed: TetMesh, points: Array, seen: Array, settle
     found = extrapolate(laid_out, nodes, (points - laid_out.points)[nodes], Tissue(), weights[nodes])
     u = laid_out.points + found.u - placed.points
     return replace(found, u=u, det_f=signed_volumes(placed.points + u, mesh.tets) / placed.volumes)
+
+
+def depth_of_nodes(mesh: TetMesh) -> Array:
+    """Depth (n,) mm of a mesh's nodes below its surface."""
+    return -closest_points(mesh.boundary, mesh.points).distance
 
 
 def _laid_out(placed: TetMesh, points: Array, believed: Array) -> Array:
@@ -206,7 +230,7 @@ def as_side(side: str) -> Side:
     return "left" if side == "left" else "right"
 
 
-def _hinted(case: Case) -> RigidTransform | None:
+def _hinted(case: CaseBefore) -> RigidTransform | None:
     """Start of the spine search from the same vertebra marked in both images; None without hints."""
     ct, inflated = case.hints.spine_ct_ras, case.hints.spine_cbct_inflated_ras
     if ct is None or inflated is None:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from registration.volume import Mask
-from vatsloc.case import Case
+from registration.volume import Mask, Volume
+from vatsloc.case import Case, CaseBefore
 from vatsloc.imaging.cbct import PreparedCbct, prepare_cbct
 from vatsloc.imaging.lung_hint import operated_lung
 from vatsloc.imaging.lungs import Lungs, segment_lungs
@@ -15,21 +15,55 @@ from vatsloc.workflow.stages import CT, DEFLATED, INFLATED, Stages
 
 
 @dataclass(frozen=True)
-class Prepared:
-    """Images fit for registration. lung_ct: the operated lung on the CT's grid; gas: beside the lungs in the CBCTs."""
+class PreparedCt:
+    """The CT fit for registration. lung_ct: the operated lung on the CT's grid."""
 
     lungs: Lungs
     lung_ct: Mask
-    inflated: PreparedCbct
-    deflated: PreparedCbct
     spine_ct: Spine
+
+
+@dataclass(frozen=True)
+class PreparedBefore(PreparedCt):
+    """The images from before the collapse."""
+
+    inflated: PreparedCbct
     spine_inflated: Spine
+
+
+@dataclass(frozen=True)
+class Prepared(PreparedBefore):
+    """All images fit for registration. gas: beside the lungs in the cone-beam CTs."""
+
+    deflated: PreparedCbct
     spine_deflated: Spine
     gas: PleuralGas
 
 
-def prepare(case: Case, stages: Stages) -> Prepared:
-    """Segment the CT and clean the cone-beam images. Raises InputRefused when one does not show what it should."""
+def prepare(case: Case, stages: Stages, known: PreparedCt | None = None) -> Prepared:
+    """Segment the CT and clean the cone-beam images, but for what is known.
+
+    Raises InputRefused when one does not show what it should.
+    """
+    before = known if isinstance(known, PreparedBefore) else prepare_before(case, case.cbct_inflated, stages, known)
+    deflated, spine = _cbct(case.cbct_deflated, DEFLATED, stages)
+    with stages.stage("spines", DEFLATED):
+        gas = pleural_gas(before.inflated, deflated, before.spine_inflated, spine)
+        gas.require(case.side, case.side_told_by)
+    return Prepared(**vars(before), deflated=deflated, spine_deflated=spine, gas=gas)
+
+
+def prepare_before(
+    case: CaseBefore, cbct_inflated: Volume, stages: Stages, known: PreparedCt | None = None
+) -> PreparedBefore:
+    """The part of `prepare` that needs no deflated scan."""
+    ct = known or prepare_ct(case, stages)
+    inflated, spine = _cbct(cbct_inflated, INFLATED, stages)
+    return PreparedBefore(ct.lungs, ct.lung_ct, ct.spine_ct, inflated, spine)
+
+
+def prepare_ct(case: CaseBefore, stages: Stages) -> PreparedCt:
+    """The part of `prepare` that needs the CT alone."""
     with stages.stage("CT lungs", CT):
         lungs = segment_lungs(case.ct, case.side, case.nodule.mask, case.nodule.centre_ras)
     hinted = case.hints.lung_mask_ct
@@ -38,18 +72,13 @@ def prepare(case: Case, stages: Stages) -> Prepared:
         for sentence in said:
             stages.warn(sentence)
         lungs = replace(lungs, left=hinted) if case.side == "left" else replace(lungs, right=hinted)
-    with stages.stage("CBCT preparation"):
-        stages.on(INFLATED)
-        inflated = prepare_cbct(case.cbct_inflated)
-        stages.on(DEFLATED)
-        deflated = prepare_cbct(case.cbct_deflated)
-    with stages.stage("spines"):
-        stages.on(CT)
-        spine_ct = segment_spine(case.ct)
-        stages.on(INFLATED)
-        spine_inflated = segment_spine(inflated.volume, inflated.field.usable)
-        stages.on(DEFLATED)
-        spine_deflated = segment_spine(deflated.volume, deflated.field.usable)
-        gas = pleural_gas(inflated, deflated, spine_inflated, spine_deflated)
-        gas.require(case.side, case.side_told_by)
-    return Prepared(lungs, lungs.of(case.side), inflated, deflated, spine_ct, spine_inflated, spine_deflated, gas)
+    with stages.stage("spines", CT):
+        spine = segment_spine(case.ct)
+    return PreparedCt(lungs, lungs.of(case.side), spine)
+
+
+def _cbct(image: Volume, name: str, stages: Stages) -> tuple[PreparedCbct, Spine]:
+    with stages.stage("CBCT preparation", name):
+        cbct = prepare_cbct(image)
+    with stages.stage("spines", name):
+        return cbct, segment_spine(cbct.volume, cbct.field.usable)

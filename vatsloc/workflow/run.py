@@ -15,6 +15,7 @@ from registration.maps.field import DisplacementField
 from registration.spine import RigidFit
 from registration.volume import Array, Grid, Mask, Volume
 from vatsloc.case import Case, read_case
+from vatsloc.dicomout.export import dicom_of_run, write_objects
 from vatsloc.formats.folder import whole_folder
 from vatsloc.formats.meshes import Surface, TetraMesh
 from vatsloc.frames import flip_points
@@ -22,16 +23,19 @@ from vatsloc.maps import covered, sampled
 from vatsloc.report.collect import report_data
 from vatsloc.report.data import LUNG, SURFACE, Outline, Picture
 from vatsloc.report.render import write_report
-from vatsloc.results import OUTPUT_FILES, RADIUS95, REPORT, ResultData, RunRecord, write_results
+from vatsloc.report.words import WORDS
+from vatsloc.results import OUTPUT_FILES, RADIUS95, REPORT, ResultData, RunRecord, write_inputs, write_results
 from vatsloc.slicer_scene import write_result_scenes
 from vatsloc.workflow.localization import Localization
 from vatsloc.workflow.localize import localize
 from vatsloc.workflow.pneumothorax import contact_surface
 from vatsloc.workflow.pose import ChangeOfPose
 from vatsloc.workflow.quality import surface_distances
+from vatsloc.workflow.refinement import BlockRefinement
 from vatsloc.workflow.residual import Residual
 from vatsloc.workflow.settings import Settings
 from vatsloc.workflow.stages import Say, Stages, quiet
+from vatsloc.workflow.state import State, read_state
 from vatsloc.workflow.uncertainty import radius95, scatter
 
 FIELD_MARGIN_MM = 10.0
@@ -41,10 +45,13 @@ SEED = 0
 """Of the spine's samples, the only thing drawn at random; fixed, so that a run can be repeated."""
 
 
-def run_case(folder: Path, out: Path, settings: Settings, say: Say = quiet) -> dict[str, Any]:
+def run_case(
+    folder: Path, out: Path, settings: Settings, say: Say = quiet, state: Path | None = None
+) -> dict[str, Any]:
     """Localize the nodule of the case in `folder`, write everything to `out`, return what run.json holds.
 
-    Raises the errors of reading and of `localize`; `out` is then untouched.
+    state: folder that `prepare_case` made, to go on from. Raises the errors of reading and of `localize`, CaseError for
+    a state of another case; `out` is then untouched.
     """
     stages = Stages(say)
     with whole_folder(out, OUTPUT_FILES) as partial, stages.named():
@@ -52,16 +59,31 @@ def run_case(folder: Path, out: Path, settings: Settings, say: Say = quiet) -> d
             case = read_case(folder)
         for sentence in case.warnings:
             stages.warn(sentence)
-        found = localize(case, settings, stages)
+        known = None if state is None else _taken_up(state, case, settings, stages)
+        found = localize(case, settings, stages, known)
         with stages.stage("warp"):
             fields = _fields(case, found)
+        result = _result(case, found, fields, _record(case, found, settings, stages))
         with stages.stage("write"):
-            result = _result(case, found, fields, _record(case, found, settings, stages))
+            objects, why = dicom_of_run(folder, result)
+            if why:
+                stages.warn(f"No DICOM objects were written: {why}")
+                result = replace(result, run=replace(result.run, warnings=tuple(stages.warnings)))
             write_results(partial, result)
+            write_objects(partial, objects)
+            write_inputs(partial, folder, out)
             write_result_scenes(partial, folder, out, result)
         with stages.stage("report"):
             write_report(partial / REPORT, report_data(case, result, _pictures(case, found)))
     return result.run.as_json()
+
+
+def _taken_up(folder: Path, case: Case, settings: Settings, stages: Stages) -> State:
+    """The state in a folder, and what its stages had to say."""
+    with stages.stage("read"):
+        known = read_state(folder, case, settings)
+    stages.resume(known.log)
+    return known
 
 
 @dataclass(frozen=True)
@@ -224,9 +246,14 @@ def _residuals(found: Localization) -> dict[str, Any]:
         "perturbation_ensemble": {"number": len(collapse.model.ensemble), "rms_mm_at_nodule": _scatter_mm(found)},
         "model_selection": [asdict(refinement) for refinement in collapse.model.refinements],
         "residual_registration": _corrected(collapse.residual),
+        "block_refinement": {"inflated": _passes(pose.refinement), "deflated": _passes(collapse.refinement)},
         "surface_mm": {f"p{share}": np.percentile(surface_distances(collapse), share) for share in (50, 75, 90, 95)},
         "mesh": {"tetrahedra": len(pose.mesh_ct.tets), "model_tetrahedra": len(collapse.system.mesh.tets)},
     }
+
+
+def _passes(refinement: BlockRefinement | None) -> list[dict[str, Any]] | None:
+    return None if refinement is None else [asdict(one) for one in refinement.passes]
 
 
 def _scatter_mm(found: Localization) -> float:
@@ -278,17 +305,17 @@ def _pictures(case: Case, found: Localization) -> tuple[Picture, ...]:
     prepared, collapse = found.prepared, found.collapse
     return (
         Picture(
-            "Inflated lung as segmented",
-            "Lung in the inflated CBCT, after its cupping was taken away; planes through the nodule.",
+            WORDS["inflated_segmented"],
+            WORDS["inflated_segmented_says"],
             prepared.inflated.volume,
             found.nodule_inf,
-            (Outline("inflated lung", LUNG, found.pose.lung_inf),),
+            (Outline(WORDS["inflated_lung"], LUNG, found.pose.lung_inf),),
         ),
         Picture(
-            "Collapsed lung as segmented",
-            "What the model is fitted to: the lung beside the pleural air in the deflated CBCT.",
+            WORDS["collapsed_segmented"],
+            WORDS["collapsed_segmented_says"],
             prepared.deflated.volume,
             found.nodule_def,
-            (Outline("collapsed lung", SURFACE, collapse.observed.found.lung),),
+            (Outline(WORDS["collapsed_lung"], SURFACE, collapse.observed.found.lung),),
         ),
     )

@@ -79,6 +79,15 @@ class ResidualSettings(_Table):
     max_disagreement_mm: float = Field(default=3.0, gt=0)
 
 
+class RefinementSettings(_Table):
+    """Small blocks of the CT found in both cone-beam CTs, once everything else has aligned them. cell_mm: at most one
+    block per cell.
+    """
+
+    on: bool = True
+    cell_mm: float = Field(default=5.0, ge=2, le=20)
+
+
 class LeaveOutSettings(_Table):
     """Up to which value, measured on the scene, a part is left out.
 
@@ -121,6 +130,7 @@ class Settings(_Table):
     model: ModelSettings = ModelSettings()
     keypoints: KeypointSettings = KeypointSettings()
     residual: ResidualSettings = ResidualSettings()
+    refinement: RefinementSettings = RefinementSettings()
     leave_out: LeaveOutSettings = LeaveOutSettings()
     gates: GateSettings = GateSettings()
 
@@ -129,12 +139,14 @@ PRESETS: dict[str, dict[str, Any]] = {
     "fast": {
         "registration": {"grid_mm": 20.0, "levels": 3, "voxel_mm": 3.0},
         "mesh": {"edge_mm": 10.0, "model_edge_mm": 16.0},
+        "refinement": {"cell_mm": 8.0},
     },
     "balanced": {},
     "accurate": {
         "registration": {"grid_mm": 8.0, "levels": 5, "voxel_mm": 1.5},
         "mesh": {"edge_mm": 6.0},
         "residual": {"grid_mm": 10.0, "voxel_mm": 1.5},
+        "refinement": {"cell_mm": 4.0},
     },
     "auto": {"leave_out": {"first_registration_mm": 10.0, "residual_mm": 0.8}},
 }

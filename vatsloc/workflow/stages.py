@@ -22,10 +22,20 @@ def quiet(_message: str) -> None:
     """Progress callback for callers who want silence."""
 
 
+@dataclass(frozen=True)
+class Log:
+    """What stages that ran before, in another command, said. seconds: they took, by name; the rest as in `Stages`."""
+
+    seconds: dict[str, float]
+    skipped: dict[str, str]
+    choices: tuple[Choice, ...]
+    warnings: tuple[str, ...]
+
+
 @dataclass
 class Stages:
-    """Log of a run. seconds, cpu_seconds (all threads) and peak_mb: by stage name, in the order they ran; skipped:
-    stage -> why; choices: what the scene had a say in.
+    """Log of a run. seconds, cpu_seconds (all threads) and peak_mb: by stage name, in the order they first ran, a stage
+    that comes again added up; skipped: stage -> why; choices: what the scene had a say in.
     """
 
     say: Say = quiet
@@ -52,11 +62,12 @@ class Stages:
         start, start_cpu = time.perf_counter(), time.process_time()
         with self.named():
             yield
-        self.seconds[name] = round(time.perf_counter() - start, 3)
-        self.cpu_seconds[name] = round(time.process_time() - start_cpu, 3)
-        self.peak_mb[name] = round(_peak_mb(reset), 1)
+        took = round(time.perf_counter() - start, 3)
+        self.seconds[name] = round(self.seconds.get(name, 0.0) + took, 3)
+        self.cpu_seconds[name] = round(self.cpu_seconds.get(name, 0.0) + time.process_time() - start_cpu, 3)
+        self.peak_mb[name] = max(round(_peak_mb(reset), 1), self.peak_mb.get(name, 0.0))
         self._where, self._image = f"What follows the stage '{name}'", ""
-        self.say(f"{name}: {self.seconds[name]:.1f} s")
+        self.say(f"{name}: {took:.1f} s")
 
     def on(self, image: str) -> None:
         """Say which image the stage at work looks at from here on."""
@@ -89,6 +100,17 @@ class Stages:
         """Note something the reader of the result has to know."""
         self.warnings.append(sentence)
         self.say(f"warning: {sentence}")
+
+    def log(self) -> Log:
+        """What a later command has to know of these stages."""
+        return Log(dict(self.seconds), dict(self.skipped), tuple(self.choices), tuple(self.warnings))
+
+    def resume(self, log: Log) -> None:
+        """Take over what stages of an earlier command said; their seconds stay theirs."""
+        self.skipped |= log.skipped
+        self.choices += log.choices
+        for sentence in log.warnings:
+            self.warn(sentence)
 
     @property
     def total_seconds(self) -> float:

@@ -1,7 +1,7 @@
-"""DICOM: a folder with one series of slices, or one multi-frame file, stacked by position along the slice normal.
+"""DICOM: one series of slices or of multi-frame files, stacked by position along the slice normal.
 
-`series` finds the files, `frames` says where their slices lie, `pixels` what their values are; `header` guards every
-value that is read. Ref: DICOM PS3.3.
+`series` finds the files, `complete` says whether all of them are there, `frames` where their slices lie, `pixels` what
+their values are; `upright` undoes a tilted gantry, `header` guards every value that is read. Ref: DICOM PS3.3.
 """
 
 from __future__ import annotations
@@ -12,10 +12,12 @@ from pathlib import Path
 import numpy as np
 
 from vatsloc.errors import InputRefused
-from vatsloc.formats.dicom.frames import Frame, frames_of, lattice, missing_ends
+from vatsloc.formats.dicom.complete import missing_ends
+from vatsloc.formats.dicom.frames import Frame, frames_of, lattice
 from vatsloc.formats.dicom.header import Header
 from vatsloc.formats.dicom.pixels import PADDING_HU, Scale, check_pixels, scale_of, stored_pixels
 from vatsloc.formats.dicom.series import dicom_files, find_series, is_directory
+from vatsloc.formats.dicom.upright import is_tilted, tilt_degrees, upright
 from vatsloc.formats.guard import guarded
 from vatsloc.formats.raw import RawImage
 from vatsloc.frames import flip_affine
@@ -48,8 +50,12 @@ def read_dicom(path: Path, series: str | int | None = None) -> RawImage:
     for file, stored in zip(by_file, stored_pixels([headers[file] for file in by_file]), strict=True):
         for k in by_file[file]:
             hu[k] = scales[k](stored[frames[k].index])
-    warnings = (*found.left_out, *missing_ends(found.images, found.n_aside, path), *_loss(first, path))
-    return RawImage(hu.T, flip_affine(lps_from_ijk), path, warnings=warnings)
+    warnings = [*found.left_out, *missing_ends(found.images, found.n_aside, path), *_loss(first, path)]
+    if is_tilted(lps_from_ijk):
+        tilt = tilt_degrees(lps_from_ijk)
+        hu, lps_from_ijk = upright(hu, lps_from_ijk, PADDING_HU)
+        warnings.append(f"{path.name}: its slices, of a gantry tilted by {tilt:.1f} degrees, were put upright.")
+    return RawImage(hu.T, flip_affine(lps_from_ijk), path, warnings=tuple(warnings))
 
 
 @guarded("DICOM image")

@@ -13,6 +13,7 @@ import numpy as np
 
 from registration.volume import Array
 from vatsloc.errors import InputRefused
+from vatsloc.formats.dicom.complete import check_concatenations, parts_of
 from vatsloc.formats.dicom.header import Header
 
 MAX_FRAMES = 100_000
@@ -51,21 +52,31 @@ class Frame:
 
 
 def frames_of(images: Sequence[Header], path: Path) -> list[Frame]:
-    """Slices of a series, each of its own file or all of one multi-frame file; unsorted.
+    """Slices of a series, each of its own file or several of a multi-frame file; unsorted.
 
-    Raises InputRefused for files that do not belong together and for missing or malformed positions.
+    Several multi-frame files are one volume where they are parts of one concatenation, or where their slices make one
+    even lattice. Raises InputRefused for files that do not belong together and for missing or malformed positions.
     """
     counts = [image.whole("NumberOfFrames", 1, MAX_FRAMES, 1) for image in images]
-    if len(images) > 1 and max(counts) > 1:
-        raise InputRefused(
-            f"{path} holds {len(images)} files of which some are multi-frame; keep one image per folder."
-        )
     frames_of_reference = {image.text("FrameOfReferenceUID") for image in images}
     if len(frames_of_reference) > 1:
         raise InputRefused(
             f"{path} mixes {len(frames_of_reference)} frames of reference; keep the slices of one series in the folder."
         )
-    return [frame for image in images for frame in frames_of_file(image)]
+    frames = [frame for image in images for frame in frames_of_file(image)]
+    check_concatenations(images, path)
+    if len(images) > 1 and max(counts) > 1:
+        parts = parts_of(images)
+        try:
+            lattice(sorted(frames, key=lambda frame: frame.place), path)
+        except InputRefused as refusal:
+            if len(parts) == 1:
+                raise
+            raise InputRefused(
+                f"{path} holds several volumes in one series: {'; '.join(parts)}; name one file in [images], or keep "
+                "the files of one volume in the folder."
+            ) from refusal
+    return frames
 
 
 def frames_of_file(header: Header) -> list[Frame]:
@@ -197,25 +208,3 @@ def _check_even(places: list[float], path: Path, left_out: Sequence[str]) -> Non
             f"{path} has unevenly spaced slices ({gaps.min():.2f} to {gaps.max():.2f} mm apart); "
             "export a reconstruction of even spacing."
         )
-
-
-def missing_ends(images: Sequence[Header], n_aside: int, path: Path) -> list[str]:
-    """Sentences on slices that may be missing at the ends, where a gap cannot show it.
-
-    By the number of images that the series states, and by slices numbered from more than 1. n_aside: files of the
-    folder that were left out, which may be those.
-    """
-    if len(images) < 2:
-        return []
-    said = []
-    for name in ("NumberOfSeriesRelatedInstances", "ImagesInAcquisition"):
-        stated = {image.text(name) for image in images}
-        n = int(stated.pop()) if len(stated) == 1 and next(iter(stated)).isdecimal() else 0
-        if n > len(images) + n_aside:
-            said.append(f"{path.name}: {len(images)} slices, {n} stated by {name}; slices may be missing at an end.")
-            break
-    numbers = sorted(int(number) for number in (image.text("InstanceNumber") for image in images) if number.isdecimal())
-    distinct = len(numbers) == len(images) and len(set(numbers)) == len(numbers)
-    if distinct and not said and 1 + n_aside < numbers[0] <= len(images):
-        said.append(f"{path.name}: its slices are numbered from {numbers[0]}; slices may be missing at one end.")
-    return said

@@ -75,10 +75,15 @@ class Series:
 
 
 def dicom_files(path: Path) -> list[Path]:
-    """Files that a path stands for: those of a folder, those that its DICOMDIR records, or the file itself."""
+    """Files that a path stands for: those of a folder, those that its DICOMDIR records, or the file itself.
+
+    A folder that holds no DICOM file stands for all that lies below it.
+    """
     if path.is_dir():
         beside = sorted(f for f in path.iterdir() if f.is_file())
         found = [file for f in beside if is_directory(f) for file in _recorded(f)[0]]
+        if not any(is_directory(file) or _is_dicom(file) for file in beside):
+            found = _below(path)
         return sorted({*beside, *found})
     return sorted({path, *_recorded(path)[0]}) if is_directory(path) else [path]
 
@@ -86,6 +91,23 @@ def dicom_files(path: Path) -> list[Path]:
 def is_directory(path: Path) -> bool:
     """Whether a file is a DICOMDIR by its name, which the standard fixes."""
     return path.name.upper() == "DICOMDIR" and path.is_file()
+
+
+def _is_dicom(file: Path) -> bool:
+    """Whether a file begins as DICOM files do."""
+    with file.open("rb") as stream:
+        return stream.read(132)[128:] == b"DICM"
+
+
+def _below(folder: Path) -> list[Path]:
+    """Files of the folders below one, but for hidden ones. Raises InputRefused for more than `_MANY`."""
+    found: list[Path] = []
+    for file in folder.rglob("*"):
+        if file.is_file() and not any(part.startswith(".") for part in file.relative_to(folder).parts):
+            found.append(file)
+            if len(found) > _MANY:
+                raise InputRefused(f"{folder} has more than {_MANY} files below it; name the folder of one scan.")
+    return found
 
 
 def find_series(path: Path, wanted: str | int | None = None) -> Series:
@@ -165,7 +187,7 @@ def _is_single(series: Series) -> bool:
 
 def _may_be_volume(series: Series) -> bool:
     """Whether it has several slices, and those in files of their own say where they lie, unlike pages of a report."""
-    frames = series.images[0].whole("NumberOfFrames", 1, _MANY, 1)
+    frames = max(image.whole("NumberOfFrames", 1, _MANY, 1) for image in series.images)
     return frames > 1 or (len(series.images) > 1 and any("ImagePositionPatient" in image for image in series.images))
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from vatsloc.formats.folder import RUN_FILE
 from vatsloc.study.bench.registration import PHANTOMS, case_folder
-from vatsloc.study.cohort.cohort import THIS_PROGRAM, Outcome, find_cases, run_cohort, summary
+from vatsloc.study.cohort.cohort import Outcome, find_cases, run_cohort, summary
 from vatsloc.study.cohort.cohort import as_json as cohort_json
 from vatsloc.study.tables import markdown
 from vatsloc.workflow.stages import Say, quiet
@@ -23,7 +23,7 @@ def bench_fit(
     folders: Sequence[Path],
     out: Path | None = None,
     jobs: int = 1,
-    program: tuple[str, ...] = THIS_PROGRAM,
+    program: tuple[str, ...] | None = None,
     say: Say = quiet,
 ) -> dict[str, Any]:
     """Localize and score case folders, folders of them, or phantoms "NAME:SEED" (three of them when none is given).

@@ -4,95 +4,32 @@ from __future__ import annotations
 
 import csv
 import io
-import json
+import math
 import os
-import subprocess
-import sys
 import time
 from collections.abc import Sequence
-from concurrent.futures import as_completed
-from dataclasses import asdict, dataclass, replace
+from concurrent.futures import Future, as_completed
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import jinja2
 
 from vatsloc.errors import CaseError
+from vatsloc.evaluation.evaluate import DENSE_DEPTHS_MM
 from vatsloc.formats.casefile import FILE_NAME
-from vatsloc.formats.folder import RUN_FILE, write_whole
+from vatsloc.formats.folder import write_whole
 from vatsloc.results import REPORT
+from vatsloc.study.cohort.job import RIGHT_MM, SILENT_MM, Job, NotSeen, Outcome, asked_of, kept_outcome, run_one
 from vatsloc.study.cohort.pool import pool
 from vatsloc.workflow.stages import Say, quiet
 
-OUTCOME_FILE = "outcome.json"
-SILENT_MM = 10.0
-"""A nodule or a mean landmark error beyond this under exit code 0 is a silent failure."""
-THIS_PROGRAM = (sys.executable, "-m", "vatsloc")
+BAR = 20
+LOST = -9
+"""Exit code of a case whose Dask workers died, as if it had been killed."""
 
 _PHASES = {"phase1": "phase 1", "phase2": "phase 2", "chain": "chain"}
 _STATISTICS = ("mean", "p95", "max")
-
-
-@dataclass(frozen=True)
-class Job:
-    """One case to run. folder: for its result; settings: TOML file or None; program: how the command line is called;
-    threads: of its kernels."""
-
-    case: Path
-    folder: Path
-    preset: str
-    settings: Path | None
-    program: tuple[str, ...]
-    threads: int
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """How one case ended. exit_code: of localize, negative where a signal ended it; seconds: wall time of localize;
-    peak_mb: as run.json says, else that of its process, no less than this one's; says: the last line of localize or
-    evaluate, whichever failed; evaluate_code: exit code of evaluate, None where it had nothing to score; scores:
-    tre.json, or None; asked: case, its date, preset, settings."""
-
-    name: str
-    exit_code: int
-    seconds: float
-    peak_mb: float
-    says: str
-    failed_gates: list[str]
-    evaluate_code: int | None
-    scores: dict[str, Any] | None
-    asked: list[str]
-
-    @property
-    def complete(self) -> bool:
-        """Whether nothing is gained by running it again: it has its scores, or the program said why not."""
-        return self.exit_code in (2, 3, 4) or self.evaluate_code in (0, 2, 3)
-
-    @property
-    def silent_failure(self) -> bool | None:
-        """Wrong by more than `SILENT_MM` without a word; None where there is nothing to tell it by."""
-        errors = [e for e in (self.phase("chain", "mean"), self.nodule_mm) if e is not None]
-        return None if not errors else self.exit_code == 0 and max(errors) > SILENT_MM
-
-    @property
-    def nodule_mm(self) -> float | None:
-        """Error of the nodule in the deflated image, mm."""
-        return None if self.scores is None else self.scores["nodule_deflated_mm"]
-
-    @property
-    def nodule_in_ellipsoid(self) -> bool | None:
-        """Whether the 95 % ellipsoid holds the true nodule."""
-        return None if self.scores is None else self.scores["nodule_in_ellipsoid95"]
-
-    @property
-    def landmarks_in_radius(self) -> tuple[int, int]:
-        """How many landmarks lie within the 95 % radius that the run gave them, and of how many that is known."""
-        held = (self.scores or {}).get("in_radius95", {}).get("landmarks", {})
-        return (round(held["share"] * held["n"]), held["n"]) if held.get("n") else (0, 0)
-
-    def phase(self, name: str, statistic: str) -> float | None:
-        """A statistic of the landmark errors of "phase1", "phase2" or "chain", mm."""
-        return None if self.scores is None else self.scores[name][statistic]
 
 
 def find_cases(folders: Sequence[Path]) -> list[Path]:
@@ -118,51 +55,56 @@ def run_cohort(
     settings: Path | None = None,
     jobs: int = 1,
     scheduler: str | None = None,
-    program: tuple[str, ...] = THIS_PROGRAM,
+    program: tuple[str, ...] | None = None,
     say: Say = quiet,
 ) -> list[Outcome]:
     """Localize and score every case, `jobs` at once or on the workers of a Dask `scheduler` that see the same files.
 
     A crash of one stops no other. Cases whose outcome is in `out` already are not run again. Writes cohort.csv,
-    cohort.md and cohort.html after every case.
+    cohort.md and cohort.html after every case. Raises CaseError where the scheduler or its workers cannot do it.
     """
     out.mkdir(parents=True, exist_ok=True)
-    threads = max(1, (os.cpu_count() or 1) // jobs) if scheduler is None else 1
-    todo = [
-        Job(case.resolve(), (out / case.resolve().name).resolve(), preset, settings, program, threads) for case in cases
-    ]
-    done = {job.folder.name: old for job in todo if (old := _kept(job)) is not None}
-    missing = [job for job in todo if job.folder.name not in done]
-    say(f"{len(done)} of {len(todo)} cases are done, {len(missing)} to run")
-    with pool(jobs, scheduler) as executor:
-        running = [executor.submit(run_one, job) for job in missing]
-        for finished in as_completed(running):
-            outcome = finished.result()
+    threads = max(1, (os.cpu_count() or 1) // jobs) if scheduler is None else None
+    folders = [(out / case.resolve().name).resolve() for case in cases]
+    with pool(jobs, scheduler, out.resolve(), [case.resolve() for case in cases]) as place:
+        todo = [
+            Job(case.resolve(), folder, preset, settings and settings.resolve(), program, threads, place.shares)
+            for case, folder in zip(cases, folders, strict=True)
+        ]
+        done = {job.folder.name: old for job in todo if (old := kept_outcome(job)) is not None}
+        missing = [job for job in todo if job.folder.name not in done]
+        say(f"{len(done)} of {len(todo)} cases are done, {len(missing)} to run")
+        start = time.monotonic()
+        running = {place.executor.submit(run_one, job): job for job in missing}
+        for n, finished in enumerate(as_completed(running), 1):
+            outcome = _outcome(finished, running[finished])
             done[outcome.name] = outcome
-            say(f"{outcome.name}: exit {outcome.exit_code}, {outcome.seconds:.0f} s {outcome.says}".rstrip())
+            bar = progress(len(done), len(todo), n, time.monotonic() - start)
+            say(f"{bar} {outcome.name}: exit {outcome.exit_code}, {outcome.seconds:.0f} s {outcome.says}".rstrip())
             write_tables(out, _in_order(todo, done))
     outcomes = _in_order(todo, done)
     write_tables(out, outcomes)
     return outcomes
 
 
-def run_one(job: Job) -> Outcome:
-    """Localize and score one case, each in a process of its own, and keep the outcome beside its result."""
-    job.folder.mkdir(parents=True, exist_ok=True)
-    result = job.folder / "result"
-    options = ["--preset", job.preset, *([] if job.settings is None else ["--settings", str(job.settings)])]
-    code, seconds, peak, says = _measured(job, ["localize", str(job.case), "--out", str(result), *options])
-    outcome = Outcome(job.folder.name, code, seconds, peak, says if code else "", [], None, None, _asked(job))
-    if code in (0, 5):
-        run = json.loads((result / RUN_FILE).read_text(encoding="utf-8"))
-        gates = [name for name, gate in run["gates"].items() if not gate["ok"]]
-        evaluated, _, _, said = _measured(job, ["evaluate", str(job.case), str(result)])
-        scores = json.loads((result / "tre.json").read_text(encoding="utf-8")) if evaluated == 0 else None
-        said = said if evaluated else outcome.says
-        outcome = replace(outcome, failed_gates=gates, evaluate_code=evaluated, scores=scores, says=said)
-        outcome = replace(outcome, peak_mb=run["peak_mb"])
-    write_whole(job.folder / OUTCOME_FILE, json.dumps(asdict(outcome), indent=1) + "\n")
-    return outcome
+def progress(done: int, total: int, ran: int, seconds: float) -> str:
+    """A bar of what is done, and the time that the rest takes at the pace of the `ran` cases of this run."""
+    filled = BAR * done // max(total, 1)
+    left = seconds / max(ran, 1) * (total - done) / 60
+    return f"[{'#' * filled}{'.' * (BAR - filled)}] {done}/{total}" + (
+        f", {left:.0f} min left;" if total > done else ";"
+    )
+
+
+def _outcome(finished: Future[Outcome], job: Job) -> Outcome:
+    """What became of a case; one that its workers lost again and again is noted, and taken up by the next run."""
+    try:
+        return finished.result()
+    except Exception as error:
+        if not (isinstance(error, NotSeen) or type(error).__name__ == "KilledWorker"):
+            raise
+        says = str(error) if isinstance(error, NotSeen) else "every worker that took it died; look at the workers' logs"
+        return Outcome(job.folder.name, LOST, 0.0, 0.0, says, [], None, None, asked_of(job))
 
 
 def write_tables(out: Path, outcomes: Sequence[Outcome]) -> None:
@@ -192,10 +134,13 @@ def summary(outcomes: Sequence[Outcome]) -> str:
     held = [o.nodule_in_ellipsoid for o in outcomes if o.nodule_in_ellipsoid is not None]
     trusted = [o.nodule_in_ellipsoid for o in outcomes if o.exit_code == 0 and o.nodule_in_ellipsoid is not None]
     silent = [o.silent_failure for o in outcomes if o.silent_failure is not None]
+    alarms = [o.false_alarm for o in outcomes if o.false_alarm is not None]
     return (
         f"{len(outcomes)} cases, {sum(o.exit_code == 0 for o in outcomes)} with exit code 0. "
         f"The 95 % ellipsoid holds the nodule in {_of(held)} cases ({_of(trusted)} under exit code 0). "
         f"Their own 95 % radius holds {_sum(outcomes)} landmarks. "
+        f"{_tissue_in_radius(outcomes)}"
+        f"False alarms (a gate failed, yet nodule and tissue are right to {RIGHT_MM:g} mm on average): {_of(alarms)}. "
         f"Silent failures (nodule or mean landmark error over {SILENT_MM:g} mm under exit code 0): {_of(silent)}."
     )
 
@@ -211,10 +156,22 @@ def as_json(outcomes: Sequence[Outcome]) -> dict[str, Any]:
     }
 
 
+DEPTHS_MM = tuple(pairwise(DENSE_DEPTHS_MM))
+SHALLOW_MM = DEPTHS_MM[:2]
+"""Classes of depth that have columns of their own: where nodules lie that nobody can feel."""
 _HEADS = (
-    "case", "exit", *_PHASES.values(), "nodule", "ellipsoid holds it", "landmarks in their 95 % radius",
-    "failed gates", "s", "MB", "says"
-)  # fmt: skip
+    "case",
+    "exit",
+    *_PHASES.values(),
+    *(f"tissue {from_mm:g}-{to_mm:g} mm" for from_mm, to_mm in SHALLOW_MM),
+    "nodule",
+    "ellipsoid holds it",
+    "landmarks in their 95 % radius",
+    "failed gates",
+    "s",
+    "MB",
+    "says",
+)
 
 
 def _record(o: Outcome) -> dict[str, Any]:
@@ -223,10 +180,17 @@ def _record(o: Outcome) -> dict[str, Any]:
         "case": o.name,
         "exit_code": o.exit_code,
         **errors,
+        **{
+            f"tissue_{from_mm:g}_{to_mm:g}_{s}_mm": (o.tissue(from_mm) or {"chain": {s: None}})["chain"][s]
+            for from_mm, to_mm in SHALLOW_MM
+            for s in ("mean", "p95")
+        },
+        "tissue_in_view_mm": o.tissue_mm,
         "nodule_mm": o.nodule_mm,
         "nodule_in_ellipsoid95": o.nodule_in_ellipsoid,
         "landmarks_in_radius95": _share(o.landmarks_in_radius),
         "silent_failure": o.silent_failure,
+        "false_alarm": o.false_alarm,
         "failed_gates": " ".join(o.failed_gates),
         "seconds": round(o.seconds, 1),
         "peak_mb": round(o.peak_mb),
@@ -240,7 +204,9 @@ def _cells(o: Outcome) -> list[str]:
     says = "" if o.failed_gates else o.says.replace("|", "/")
     radius = "{} of {}".format(*o.landmarks_in_radius) if o.landmarks_in_radius[1] else ""
     tail = [radius, ", ".join(o.failed_gates), f"{o.seconds:.0f}", f"{o.peak_mb:.0f}", says]
-    return [o.name, str(o.exit_code), *phases, _number(o.nodule_mm), held, *tail]
+    classes = [o.tissue(from_mm) for from_mm, _ in SHALLOW_MM]
+    tissue = [" / ".join(_number(d["chain"][s]) for s in ("mean", "p95")) if d else "" for d in classes]
+    return [o.name, str(o.exit_code), *phases, *tissue, _number(o.nodule_mm), held, *tail]
 
 
 def _number(value: float | None) -> str:
@@ -260,37 +226,20 @@ def _sum(outcomes: Sequence[Outcome]) -> str:
     return f"{sum(held for held, _ in counts)} of {sum(known for _, known in counts)}"
 
 
+def _tissue_in_radius(outcomes: Sequence[Outcome]) -> str:
+    """Sentence about the share of tissue within its 95 % radius, class of depth by class; empty without dense truth."""
+    parts = []
+    for from_mm, to_mm in DEPTHS_MM:
+        known = [d for d in (o.tissue(from_mm) for o in outcomes) if d and d["share_in_radius95"] is not None]
+        if known:
+            share = sum(d["share_in_radius95"] * d["n"] for d in known) / sum(d["n"] for d in known)
+            parts.append(
+                f"{100 * share:.1f} % at {from_mm:g} {f'to {to_mm:g} mm' if to_mm < math.inf else 'mm and deeper'}"
+            )
+    return (
+        f"Their own 95 % radius holds tissue in view by depth below the pleura: {', '.join(parts)}. " if parts else ""
+    )
+
+
 def _in_order(jobs: Sequence[Job], done: dict[str, Outcome]) -> list[Outcome]:
     return [done[job.folder.name] for job in jobs if job.folder.name in done]
-
-
-def _asked(job: Job) -> list[str]:
-    text = "" if job.settings is None else job.settings.read_text(encoding="utf-8")
-    return [str(job.case), str((job.case / FILE_NAME).stat().st_mtime_ns), job.preset, text]
-
-
-def _kept(job: Job) -> Outcome | None:
-    """The outcome of an earlier run that asked the same; None where there is none or it ended without a word."""
-    try:
-        old = Outcome(**json.loads((job.folder / OUTCOME_FILE).read_text(encoding="utf-8")))
-    except (OSError, ValueError, TypeError):
-        return None
-    return old if old.complete and old.asked == _asked(job) else None
-
-
-def _measured(job: Job, arguments: list[str]) -> tuple[int, float, float, str]:
-    """Exit code, seconds, peak memory in MB and last words of the program called with `arguments`; its talk is kept."""
-    limits = {"NUMBA_NUM_THREADS": str(job.threads), "OPENBLAS_NUM_THREADS": "1"}
-    log = job.folder / f"{arguments[0]}.log"
-    start = time.monotonic()
-    with log.open("wb") as talk:
-        process = subprocess.Popen([*job.program, *arguments], stdout=talk, stderr=talk, env=os.environ | limits)
-        try:
-            _, status, usage = os.wait4(process.pid, 0)
-        except BaseException:
-            process.kill()
-            process.wait()
-            raise
-    process.returncode = os.waitstatus_to_exitcode(status)
-    words = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
-    return process.returncode, time.monotonic() - start, usage.ru_maxrss / 1024, words[-1] if words else ""

@@ -1,0 +1,179 @@
+"""Refinement by small blocks: what is left between the CT, carried by a result, and a cone-beam CT is measured all over
+the lung, right up to the pleura, and followed elastically.
+
+Vessels reach within a few millimetres of the pleura, but only blocks of 7 to 11 mm that are cut off at the pleura see
+them, and such blocks are found only where a map is right to a few millimetres. So this comes last in each phase.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from poro.fem import Tissue
+from poro.fit import PointConstraints, elastic_correction
+from poro.mesh import TetMesh, closest_points
+from poro.mesh.tetmesh import signed_volumes
+from registration.correspondences import Correspondences
+from registration.images.morphology import bounding_box, erode
+from registration.images.resample import coarsen, resample_mask
+from registration.keypoints.aligned_matching import AlignedSettings, Regions, match_aligned
+from registration.keypoints.matching import MatchSettings, detect_inside
+from registration.volume import Array, Mask, Volume
+from vatsloc.imaging.cbct import PreparedCbct
+from vatsloc.maps import MeshMap
+from vatsloc.workflow.hold_out import held_out, too_few
+from vatsloc.workflow.settings import RefinementSettings
+
+PASSES = ((1.5, 6.0), (1.0, 3.0))
+"""Voxels of the blocks and how far they are looked for, mm, pass by pass."""
+MARGIN_MM = 16.0
+"""What is kept of a scan about the lung: more than a block and its search reach."""
+RIM_MM = 2.5
+"""What is cut off the lung in both images: nearer than this to its border, voxels also show what lies beyond."""
+SIGMA_MM, STRAIN = 1.0, 0.007
+"""Standard deviation of a block's position, and how far tissue gives way to it (`elastic_correction`)."""
+ANCHOR_SIGMA_MM = 0.2
+"""Standard deviation of nodes that other evidence has placed."""
+ROUNDS = 4
+"""How often nodes of elements that would turn over are held before the lung stays as it was."""
+APART_MM = 15.0
+"""Blocks are held out by cubes this wide: they are dense, and what they tell does not reach far."""
+
+
+@dataclass(frozen=True)
+class Compared:
+    """What is compared. ct, lung_ct: the CT and its lung; scan, lung: a cone-beam CT and the lung found there."""
+
+    ct: Volume
+    lung_ct: Mask
+    scan: PreparedCbct
+    lung: Mask
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A lung in a scan. rest: undeformed, in the scan's frame; map: from the CT, with the same tetrahedra; anchors:
+    (k,) nodes that other evidence has placed; within_mm: how deep below the pleura blocks are followed.
+    """
+
+    rest: TetMesh
+    map: MeshMap
+    anchors: Array
+    within_mm: float = float("inf")
+
+    def moved(self, points: Array) -> Shape:
+        """The same lung with its nodes at points (n, 3) mm of the scan."""
+        return replace(self, map=replace(self.map, moved=points))
+
+
+@dataclass(frozen=True)
+class Pass:
+    """One pass. voxel_mm: of the blocks; blocks: how many were found; before_mm, after_mm: median misfit at held-out
+    ones, without and with following the others; kept: whether the lung followed.
+    """
+
+    voxel_mm: float
+    blocks: int
+    before_mm: float
+    after_mm: float
+    kept: bool
+
+
+@dataclass(frozen=True)
+class BlockRefinement:
+    """A lung that followed blocks. points: (n, 3) mm, its nodes in the scan; passes: what each found and did."""
+
+    points: Array
+    passes: tuple[Pass, ...]
+
+
+def refine_by_blocks(compared: Compared, shape: Shape, settings: RefinementSettings) -> BlockRefinement:
+    """Nodes of a lung moved to where small blocks of the CT are found in a scan; as they were where none judge well."""
+    around = _around(compared)
+    starts = _starts(around, settings.cell_mm)
+    passes: list[Pass] = []
+    for voxel_mm, reach_mm in PASSES:
+        matches = _blocks(around, starts, shape.map, voxel_mm, reach_mm)
+        matches = matches.only(_depth(shape.map.mesh, matches.moving) <= shape.within_mm)
+        if too_few(matches):
+            break
+        hidden = held_out(matches.fixed, APART_MM)
+        tested = matches.only(hidden)
+        before, after = _misfit(shape, tested), _misfit(_followed(shape, matches.only(~hidden)), tested)
+        passes.append(Pass(voxel_mm, len(matches), before, after, after < before))
+        if after < before:
+            shape = _followed(shape, matches)
+    return BlockRefinement(shape.map.moved, tuple(passes))
+
+
+def _around(compared: Compared) -> Compared:
+    """The scan cut to its lung, the CT to the lung there, and of the lungs what lies deeper than RIM_MM."""
+    scan, ct = compared.scan, compared.ct
+    lung = resample_mask(compared.lung, scan.volume.grid)
+    lung = Mask(lung.inside & scan.field.usable.inside, lung.ras_from_ijk)
+    if not lung.inside.any():
+        return replace(compared, lung=lung)
+    margin = np.ceil(MARGIN_MM / lung.grid.spacing).astype(int)
+    cut = bounding_box(lung.inside, margin)
+    lung_ct = resample_mask(compared.lung_ct, ct.grid)
+    cut_ct = bounding_box(lung_ct.inside, np.ceil(MARGIN_MM / ct.grid.spacing).astype(int))
+    inner, inner_ct = (
+        Mask(erode(mask.inside, RIM_MM, mask.grid.spacing), mask.ras_from_ijk)
+        for mask in (lung.part(cut), lung_ct.part(cut_ct))
+    )
+    return Compared(ct.part(cut_ct), inner_ct, replace(scan, volume=scan.volume.part(cut)), inner)
+
+
+def _starts(compared: Compared, cell_mm: float) -> Array:
+    """Distinctive points (n, 3) RAS mm of the scan's lung, at most one a cell."""
+    image = coarsen(compared.scan.volume, PASSES[0][0])
+    inside = resample_mask(compared.lung, image.grid).inside
+    if not inside.any():
+        return np.zeros((0, 3))
+    settings = MatchSettings(voxel_mm=PASSES[0][0], cell_mm=cell_mm)
+    return image.grid.to_ras(detect_inside(image, inside, settings).astype(float))
+
+
+def _blocks(
+    compared: Compared, starts: Array, scan_from_ct: MeshMap, voxel_mm: float, reach_mm: float
+) -> Correspondences:
+    """Blocks of the scan about points (n, 3), `fixed`, found in the CT, `moving`."""
+    scan, ct = coarsen(compared.scan.volume, voxel_mm), coarsen(compared.ct, voxel_mm)
+    regions = Regions(resample_mask(compared.lung, scan.grid), resample_mask(compared.lung_ct, ct.grid))
+    back = scan_from_ct.inverse().linearized
+    return match_aligned(scan, ct, regions, starts, back, AlignedSettings(reach_mm))
+
+
+def _depth(mesh: TetMesh, points: Array) -> Array:
+    """Depth (n,) mm of points below a lung's surface."""
+    return -closest_points(mesh.boundary, points).distance
+
+
+def _followed(shape: Shape, matches: Correspondences) -> Shape:
+    """The lung after it followed matches. Nodes of elements that would turn over are held too; as it was where that
+    does not help.
+    """
+    anchors, rest, now = shape.anchors, shape.rest, shape.map.moved
+    at = MeshMap(shape.map.mesh, rest.points, shape.map.around)(matches.moving)
+    offset = matches.fixed - shape.map(matches.moving)
+    turned = signed_volumes(now, rest.tets) <= 0
+    for _ in range(ROUNDS):
+        k = len(anchors)
+        wanted = PointConstraints(
+            np.concatenate([at, rest.points[anchors]]),
+            np.concatenate([offset, np.zeros((k, 3))]),
+            np.concatenate([np.full(len(at), SIGMA_MM), np.full(k, ANCHOR_SIGMA_MM)]),
+            np.zeros((len(at) + k, 3)),
+        )
+        field = elastic_correction(rest, now - rest.points, Tissue(), wanted, model_sigma=STRAIN, rounds=1).u
+        turns = (signed_volumes(now + field, rest.tets) <= 0) & ~turned
+        if not turns.any():
+            return shape.moved(now + field)
+        anchors = np.union1d(anchors, rest.tets[turns])
+    return shape
+
+
+def _misfit(shape: Shape, matches: Correspondences) -> float:
+    return float(np.median(np.linalg.norm(shape.map(matches.moving) - matches.fixed, axis=1)))
