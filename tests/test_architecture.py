@@ -36,6 +36,7 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         "contact": {"arrays", "errors", "linalg", "mesh"},
         "collapse": {"arrays", "errors", "contact", "fem", "linalg", "mesh"},
         "fit": {"arrays", "collapse", "fem", "mesh"},
+        "breathing": {"arrays", "errors", "contact", "fem", "linalg", "mesh"},
     },
     "vatsloc": {
         "errors": set(),
@@ -58,17 +59,18 @@ ROOMS: dict[str, dict[str, set[str]]] = {
             *("errors", "frames", "lazy", "maps", "formats", "imaging", "case", "results", "report", "slicer_scene"),
             "dicomout",
         },
+        "breathing": {"errors", "frames", "lazy", "maps", "formats", "imaging", "workflow"},
         "dicomnet": {"errors", "lazy", "formats", "imaging", "workflow", "dicomout"},
         "evaluation": {"errors", "frames", "maps", "formats", "imaging", "case", "results", "report"},
         "synthetic": {"errors", "frames", "lazy", "formats", "imaging", "workflow"},
         "study": {
             *("errors", "frames", "lazy", "maps", "terminal", "formats", "imaging", "case", "results", "report"),
-            *("workflow", "evaluation", "synthetic"),
+            *("workflow", "evaluation", "synthetic", "breathing"),
         },
         "phantom_command": {"errors", "terminal", "synthetic", "study"},
         "cli": {
             *("errors", "terminal", "phantom_command", "new_case", "workflow", "evaluation", "synthetic", "study"),
-            *("dicomout", "dicomnet", "navigation"),
+            *("dicomout", "dicomnet", "navigation", "breathing"),
         },
         "__main__": {"cli"},
     },

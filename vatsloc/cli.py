@@ -180,6 +180,29 @@ def evaluate(
 
 
 @app.command()
+def breathe(
+    case: Annotated[Path, typer.Argument(metavar="CASE", help="Folder with breath.toml, or with lung masks.")],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Results folder, written whole or not at all.")],
+    driver: Annotated[
+        str, typer.Option(metavar="NAME", help="pressure-volume, regional-pressure, one-scan or surface.")
+    ],
+    states: Annotated[int, typer.Option(metavar="N", help="Number of states.")] = 10,
+    fit_landmarks: Annotated[
+        bool, typer.Option("--fit-landmarks", help="Experiment: regional-pressure is fitted to the landmarks as well.")
+    ] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Make the lungs of CASE breathe: meshes, fields, images and a film of every state."""
+    from vatsloc.breathing.run import breathe_case
+
+    result = breathe_case(case, out, driver, states, say, fit_landmarks)
+    if as_json:
+        show(result)
+    else:
+        print(out / "breath.html")
+
+
+@app.command()
 def export_dicom(
     result: Annotated[Path, typer.Argument(metavar="RESULT", help="Results folder of localize.")],
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the DICOM files.")],

@@ -12,14 +12,15 @@ from matplotlib.axes import Axes
 from numpy.testing import assert_allclose
 
 from poro.arrays import Array
+from poro.breathing.affine import affine_to_points, affine_to_shape
+from poro.breathing.elastic import Lung
 from poro.mesh import TetMesh
 from registration.volume import Mask
+from vatsloc.breathing.masks import to_the_back
 from vatsloc.errors import CaseError, InputRefused
 from vatsloc.study.bench import real as bench
 from vatsloc.study.bench import real_draw
-from vatsloc.study.bench.affine import affine_to_points, affine_to_shape
-from vatsloc.study.bench.breathing import Lung
-from vatsloc.study.bench.breaths import EXPIRATION, INSPIRATION, LANDMARKS, Marks, read_person, to_the_back
+from vatsloc.study.bench.breaths import EXPIRATION, INSPIRATION, LANDMARKS, Marks, read_person
 from vatsloc.study.bench.poro_lung import lung, wall_level
 
 CENTRES = {"left": np.array([-65.0, 0.0, 0.0]), "right": np.array([65.0, 0.0, 0.0])}

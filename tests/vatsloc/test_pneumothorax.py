@@ -16,7 +16,15 @@ from registration.volume import Array
 from tests.vatsloc import ball_scene as scene
 from vatsloc.workflow import pneumothorax as module
 from vatsloc.workflow.model_selection import CollapseModel, Refinement
-from vatsloc.workflow.pneumothorax import REFINEMENT, RESIDUAL, Collapse, collapse, contact_surface, pneumothorax, refined
+from vatsloc.workflow.pneumothorax import (
+    REFINEMENT,
+    RESIDUAL,
+    Collapse,
+    collapse,
+    contact_surface,
+    pneumothorax,
+    refined,
+)
 from vatsloc.workflow.pose import ChangeOfPose
 from vatsloc.workflow.refinement import BlockRefinement, Compared, Shape
 from vatsloc.workflow.residual import Residual

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from poro.breathing.affine import affine_to_points
 from poro.fit import FitStatus
 from poro.mesh import TetMesh
 from registration.ffd import FfdSettings, Weights
@@ -22,7 +23,6 @@ from registration.maps.rigid import RigidTransform
 from registration.volume import Mask, Volume
 from tests.vatsloc.browser import CHROMIUM, asked_by_the_page, visit
 from vatsloc.errors import CaseError, InputRefused
-from vatsloc.study.bench.affine import affine_to_points
 from vatsloc.study.chart import chart
 from vatsloc.study.chart.chart import Row, append_row, measure_case, read_rows, run_chart
 from vatsloc.study.chart.draw import interactive, page, require_matplotlib, write_chart

@@ -173,7 +173,18 @@ def _sides(grid: Grid, pieces: list[Array], midline: float) -> dict[str, Array]:
 
 
 def _cut(joined: Array, grid: Grid, midline: float) -> list[Array]:
-    """Two lungs that touch, parted by eroding until they fall apart and growing both back together."""
+    """Two lungs that touch, parted where they are joined thinly, else at the midline."""
+    parted = part_joined(joined, grid)
+    if parted is not None:
+        return list(parted)
+    r = grid.to_ras(np.stack(np.meshgrid(*[np.arange(n) for n in joined.shape], indexing="ij"), -1).astype(float))[
+        ..., 0
+    ]
+    return [joined & (r < midline), joined & (r >= midline)]
+
+
+def part_joined(joined: Array, grid: Grid) -> tuple[Array, Array] | None:
+    """Two large parts of a mask that touch, eroded until they fall apart and grown back; None if they do not."""
     spacing = grid.spacing
     depth = ndimage.distance_transform_edt(joined, sampling=spacing)
     for radius in np.arange(2.0, 24.0, 2.0):
@@ -185,15 +196,13 @@ def _cut(joined: Array, grid: Grid, midline: float) -> list[Array]:
         one, two = np.argsort(sizes)[::-1][:2]
         if sizes[two] > 0.25 * sizes[one]:
             markers = np.where(labels == one, 1, np.where(labels == two, 2, 0)).astype(np.uint8)
-            grown = _grow_both(markers, joined, int(np.ceil(4 * radius / spacing.min())))
-            return [grown == 1, grown == 2]
-    r = grid.to_ras(np.stack(np.meshgrid(*[np.arange(n) for n in joined.shape], indexing="ij"), -1).astype(float))[
-        ..., 0
-    ]
-    return [joined & (r < midline), joined & (r >= midline)]
+            grown = grow_both(markers, joined, int(np.ceil(4 * radius / spacing.min())))
+            return grown == 1, grown == 2
+    return None
 
 
-def _grow_both(markers: Array, allowed: Array, steps: int) -> Array:
+def grow_both(markers: Array, allowed: Array, steps: int) -> Array:
+    """Marked parts (1, 2) grown within `allowed` at one pace, at most `steps` voxels far."""
     grown = markers
     for _ in range(steps):
         wider = ndimage.maximum_filter(grown, footprint=ndimage.generate_binary_structure(3, 1))

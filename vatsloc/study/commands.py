@@ -135,6 +135,23 @@ def bench_real_command(
         show(result)
 
 
+@bench.command("breathe")
+def bench_breathe_command(
+    cases: Annotated[list[Path], typer.Argument(metavar="CASE...", help="Breathing cases with landmarks.")],
+    drivers: Annotated[str | None, typer.Option(metavar="A,B,..", help="Drivers; all by default.")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Breathing lung: each driver's error at landmarks beside its paper's, the share of motion left, and seconds."""
+    from vatsloc.breathing.run import DRIVERS
+    from vatsloc.study.bench.breathe import bench_breathe, table
+
+    chosen = [name.strip() for name in drivers.split(",")] if drivers else list(DRIVERS)
+    result = bench_breathe(cases, chosen, say=say)
+    say(table(result))
+    if as_json:
+        show(result)
+
+
 @stability.command("poro")
 def stability_poro_command(
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for CSV files, plots and tables.md.")],

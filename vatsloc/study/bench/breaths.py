@@ -10,14 +10,14 @@ import numpy as np
 from scipy import ndimage
 
 from poro.arrays import Array
+from poro.breathing.elastic import Lung
 from poro.mesh import TetMesh, stuff
-from registration.images.resample import resample_mask
 from registration.volume import Mask
+from vatsloc.breathing.masks import to_the_back
 from vatsloc.errors import CaseError, InputRefused
 from vatsloc.formats.guard import reading
 from vatsloc.formats.images import read_mask
 from vatsloc.imaging.lungs import Side, split_lungs
-from vatsloc.study.bench.breathing import Lung
 
 INSPIRATION, EXPIRATION, LANDMARKS = "lungs_inspiration.nii.gz", "lungs_expiration.nii.gz", "landmarks_ras_mm.csv"
 _COLUMNS = ["insp_x", "insp_y", "insp_z", "exp_x", "exp_y", "exp_z"]
@@ -64,21 +64,6 @@ class Person:
         """Landmarks of the lung on `side`, by where they lie at inspiration."""
         here = np.array(self.inspiration.sides) == side
         return Marks(self.inspiration.landmarks[here], self.expiration.landmarks[here])
-
-
-def to_the_back(expired: Mask, inspired: Mask) -> Mask:
-    """Expired lung filled up to the back wall of the inspired one; voxels along the patient's axes.
-
-    On a patient's back, spine and back ribs lie still; but what lies lowest may grow so dense in expiration that a
-    threshold leaves it out of the mask.
-    """
-    inspired = resample_mask(inspired, expired.grid)
-    step = -1 if expired.ras_from_ijk[1, 1] < 0 else 1
-    lung, full = expired.inside[:, ::step], inspired.inside[:, ::step]
-    # Running from back to front: behind the expired lung, and not behind the inspired one.
-    behind = ~np.logical_or.accumulate(lung, axis=1) & lung.any(axis=1, keepdims=True)
-    filled = lung | (behind & np.logical_or.accumulate(full, axis=1))
-    return Mask(filled[:, ::step], expired.ras_from_ijk)
 
 
 def read_person(folder: Path) -> Person:

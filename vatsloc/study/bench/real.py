@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from poro.arrays import Array
+from poro.breathing.affine import affine_to_points, affine_to_shape
+from poro.breathing.elastic import WALL_ALONE, Breathing, Lung, breathe_out
 from poro.mesh import TetMesh, interpolate, locate
 from vatsloc.evaluation.statistics import distances, summarize
-from vatsloc.study.bench.affine import affine_to_points, affine_to_shape
-from vatsloc.study.bench.breathing import WALL_ALONE, Breathing, Lung, breathe_out
 from vatsloc.study.bench.breaths import Marks, read_person
 
 EDGE_MM = 12.0

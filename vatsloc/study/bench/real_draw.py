@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from poro.breathing.elastic import caudal
 from poro.mesh import interpolate, locate
-from vatsloc.study.bench.breathing import caudal
 from vatsloc.study.bench.breaths import read_person
 from vatsloc.study.bench.real import BREATHING, EDGE_MM, ELASTIC, ROWS
 from vatsloc.study.chart.draw import require_matplotlib

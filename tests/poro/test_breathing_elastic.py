@@ -9,10 +9,21 @@ import pytest
 from numpy.testing import assert_allclose
 
 from poro.arrays import Array
+from poro.breathing.elastic import (
+    WALL_ALONE,
+    Breathing,
+    Lung,
+    acting_at,
+    breathe_out,
+    bronchi,
+    caudal,
+    depth_of,
+    hilum,
+    spread_map,
+)
 from poro.fem import Tissue
 from poro.fem.tissue import GRAVITY_KPA_PER_MM
 from poro.mesh import TetMesh, stuff
-from vatsloc.study.bench.breathing import WALL_ALONE, Breathing, Lung, breathe_out, bronchi, caudal, hilum, spread_map
 
 HALF = np.array([35.0, 55.0, 75.0])
 
@@ -99,3 +110,11 @@ def test_the_inside_turns_with_the_ribs(flattened: Lung) -> None:
     points, inside = flattened.inspired.points, depth(flattened.inspired) > 0.3
     slope = np.polyfit(points[inside, 1], u[inside, 2], 1)[0]
     assert 0.02 < slope < 0.2
+
+
+@pytest.mark.parametrize(("ratio", "depth"), [(0.9, 0.0), (0.7, 0.5), (1 / 0.7, 0.5), (0.5, 1.0)])
+def test_a_quiet_breath_follows_its_wall_and_a_deep_one_all_that_acts(ratio: float, depth: float) -> None:
+    assert depth_of(ratio) == pytest.approx(depth)
+    assert acting_at(0.0) == WALL_ALONE
+    assert acting_at(1.0) == Breathing()
+    assert acting_at(depth).mass_kg == pytest.approx(depth * Breathing().mass_kg)

@@ -8,11 +8,13 @@ shape decides; moduli are those of `poro.fem.tissue.Tissue`.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from scipy.sparse import coo_matrix, csr_matrix, diags, vstack
 
 from poro.arrays import Array
+from poro.breathing.affine import Affine
 from poro.fem import Tissue
 from poro.fem.constraints import point_constraints
 from poro.fem.forms import stiffness
@@ -20,8 +22,8 @@ from poro.fem.tissue import GRAVITY_KPA_PER_MM
 from poro.linalg import linear_solver
 from poro.mesh import TetMesh, closest_points
 from poro.mesh.patches import INWARD
-from vatsloc.imaging.lungs import Side
-from vatsloc.study.bench.affine import Affine
+
+Side = Literal["left", "right"]
 
 ROUNDS = 6
 WALL_KPA_PER_MM = 0.3
@@ -58,6 +60,30 @@ class Breathing:
 
 
 WALL_ALONE = Breathing(0.0, 0.0, 100.0, 0.0, 1.0)
+QUIET, DEEP = 0.8, 0.6
+"""Volume left of the inspired one: a quiet breath leaves more than the first, an expiration to the end less than the
+second."""
+
+
+def depth_of(volume_ratio: float) -> float:
+    """How far a breath goes beyond a quiet one, 0 to 1, by the volume of either state over the other's."""
+    ratio = min(volume_ratio, 1 / volume_ratio)
+    return float(np.clip((QUIET - ratio) / (QUIET - DEEP), 0, 1))
+
+
+def acting_at(depth: float) -> Breathing:
+    """What acts in a breath of a depth, 0 quiet to 1 to the end of expiration.
+
+    A lung near its resting recoil follows its wall; one that has emptied sags, and its bronchi and ribs are felt.
+    """
+    quiet, deep = WALL_ALONE, Breathing()
+    return Breathing(
+        depth * deep.mass_kg,
+        depth * deep.held_kpa_mm,
+        deep.held_mm,
+        depth * deep.turn,
+        (1 - depth) * quiet.mediastinal + depth * deep.mediastinal,
+    )
 
 
 def breathe_out(lung: Lung, acting: Breathing, tissue: Tissue | None = None) -> Array:

@@ -1,0 +1,322 @@
+"""Lung, chest and what lies below the diaphragm as three elastic bodies that slide on each other, moved by pressures
+on patches of the chest's inner wall and of the diaphragm; and the fit of those pressures.
+
+Ref: Fuerst et al. (A Personalized Biomechanical Model for Respiratory Motion Prediction), eqs. 1-3, section 2.3.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+from scipy.sparse import coo_matrix, csr_matrix, diags
+
+from poro.arrays import Array
+from poro.breathing.cavity import rising
+from poro.breathing.elastic import Breathing, Lung, Side, caudal, hilum
+from poro.breathing.equilibrium import Springs
+from poro.fem.constraints import point_constraints
+from poro.fem.forms import tangent_stiffness
+from poro.fem.tissue import Tissue
+from poro.linalg.solver import linear_solver
+from poro.mesh import TetMesh, TriSurface, closest_points, stuff
+from poro.mesh.locate import Location, interpolate
+
+LUNG, BODY = Tissue(young_kpa=0.9, poisson=0.4), Tissue(young_kpa=7.8, poisson=0.43)
+"""Ref: Fuerst, section 2.2."""
+SHELL_MM, APART_MM = 30.0, 5.0
+"""Thickness of the chest about the lung, and the gap between it and the body below the diaphragm."""
+SECTORS, STOREYS, DIAPHRAGM = 4, 3, 2
+"""Patches about the lung and along it, and on the diaphragm: 14 pressures."""
+STICK_KPA_PER_MM = 0.5
+"""Sliding contact that neither lets bodies part nor enter each other: it gives way by 1 mm at 0.5 kPa."""
+TOUCH_MM = 10.0
+"""Farther from a wall at rest the lung does not touch it."""
+ANCHOR = 0.2
+"""Stiffness, over the tissue's own, by which the chest is held everywhere; back and mediastinum are held 30 times as
+firmly. The shell is no closed ring, and a round lung would turn in it."""
+SURFACE_ROUNDS, INNER = 12, 3
+PRIOR_MM_PER_KPA = 0.5
+"""Root mean square distance that a pressure of 1 kPa is held to be worth."""
+TETHER, HILUM_MM = 0.3, 25.0
+"""Stiffness, over the tissue's own, by which the hilum is held, and how far that reaches; Fuerst misses it."""
+REACH_MM = 15.0
+"""How far a step of the fit may move any node."""
+STILL_MM = 0.3
+"""Largest motion of a node in a round of contact at which the bodies have settled."""
+
+
+@dataclass(frozen=True)
+class Thorax:
+    """Three bodies in one mesh that share no node. lung: (nl,) nodes that belong to the lung, first in the mesh;
+    walls: inner surface of chest and of what is below, in nodes of the mesh; patch: (t,) of every triangle of `walls`,
+    -1 for none; gap: (k,) mm between the lung's border and the walls at rest; anchors: springs that hold
+    the chest and the lung's bronchi; load: (n, 3) kPa mm2 on the lung at the end of an inspiration.
+    """
+
+    mesh: TetMesh
+    elastic: csr_matrix
+    lung: TetMesh
+    walls: TriSurface
+    patch: Array
+    gap: Array
+    anchors: csr_matrix
+    load: Array
+
+    @property
+    def patches(self) -> int:
+        """Number of pressures."""
+        return int(self.patch.max()) + 1
+
+
+@dataclass(frozen=True)
+class Pressed:
+    """Bodies under pressures p (k,) kPa. u: (n, 3) mm; by_pressure: (n, 3, k) mm/kPa."""
+
+    p: Array
+    u: Array
+    by_pressure: Array
+
+
+@dataclass(frozen=True)
+class PressureFit:
+    """Pressures (k,) kPa that bring the lung's border to the target. history: mean surface distance in mm, per round;
+    evaluations: equilibria computed.
+    """
+
+    state: Pressed
+    history: tuple[float, ...]
+    evaluations: int
+
+
+def thorax(inside: Array, ras_from_ijk: Array, pair: Lung, acting: Breathing, edge_mm: float = 22.0) -> Thorax:
+    """Chest and sub-diaphragm bodies about the mask of an expired lung, voxels along R, A, S.
+
+    What lies below the lung is found by casting the lung towards the feet. Raises ValueError where a body is too thin.
+    """
+    lung, towards = pair.expired, caudal(pair.expired)
+    spacing = np.linalg.norm(ras_from_ijk[:3, :3], axis=0)
+    step = np.maximum(np.rint(4.0 / spacing).astype(int), 1)
+    margin = np.ceil((SHELL_MM + 8) / spacing / step).astype(int)
+    coarse = np.pad(inside[:: step[0], :: step[1], :: step[2]], [(m, m) for m in margin])
+    affine = ras_from_ijk.copy()
+    affine[:3, :3] = ras_from_ijk[:3, :3] * step
+    affine[:3, 3] -= affine[:3, :3] @ margin
+    spacing = spacing * step
+    near = ndimage.distance_transform_edt(~coarse, sampling=spacing) < SHELL_MM
+    towards_feet = (towards > 0) == (ras_from_ijk[2, 2] > 0)
+    order = slice(None) if towards_feet else slice(None, None, -1)
+    above = np.logical_or.accumulate(coarse[:, :, order], axis=2)[:, :, order]
+    last = np.logical_or.accumulate(coarse[:, :, order][:, :, ::-1], axis=2)[:, :, ::-1][:, :, order]
+    below = near & above & ~last & ~coarse
+    below = _largest(below)
+    chest = near & ~coarse & (ndimage.distance_transform_edt(~below, sampling=spacing) > APART_MM)
+    bodies = [stuff(chest, affine, edge_mm), stuff(below, affine, edge_mm)]
+    starts = np.cumsum([0, len(lung.points), len(bodies[0].points), len(bodies[1].points)])
+    points = np.concatenate([lung.points, *(body.points for body in bodies)])
+    tets = np.concatenate([mesh.tets + start for mesh, start in zip((lung, *bodies), starts[:-1], strict=True)])
+    kinds = np.repeat([0, 1, 1], [len(lung.tets), *(len(body.tets) for body in bodies)])
+    mesh = TetMesh(points, tets)
+    walls, patch = _walls(bodies, starts, lung, points)
+    gap = closest_points(walls, lung.boundary.points)
+    rest = np.einsum("qd,qd->q", lung.boundary.points - gap.points, walls.normals[gap.triangle])
+    springs, load = np.zeros(3 * len(points)), np.zeros_like(points)
+    bronchi, load[: len(lung.points)] = rising(pair, acting, LUNG)
+    springs[: 3 * len(lung.points)] = bronchi.diagonal()
+    anchors = (_anchors(bodies, starts, points, pair, towards) + diags(springs)).tocsr()
+    return Thorax(mesh, _elastic(mesh, kinds), lung, walls, patch, rest, anchors, load)
+
+
+def press(scene: Thorax, p: Array, start: Array, share: float = 1.0, rounds: int = INNER) -> Pressed:
+    """Balance of the bodies under pressures p (k,) kPa from displacements (n, 3) mm, and its derivative by them.
+
+    Tissue is linear about its rest; contact and the pressures' direction follow the moving walls, round by round.
+    """
+    u, k = start, len(p)
+    answers = np.zeros((*start.shape, k + 1))
+    for _ in range(rounds):
+        forces = _patch_forces(scene, u)
+        contact = _contact(scene, u)
+        matrix = (scene.elastic + contact.matrix + scene.anchors).tocsr()
+        right = np.concatenate([(contact.force + share * scene.load)[:, :, None], forces], axis=2)
+        answers = linear_solver(matrix, scene.mesh.points).solve(right.reshape(-1, k + 1)).reshape(answers.shape)
+        last, u = u, answers[:, :, 0] + answers[:, :, 1:] @ p
+        if np.abs(u - last).max() < STILL_MM:
+            break
+    return Pressed(p, u, answers[:, :, 1:])
+
+
+def fit_pressures(
+    scene: Thorax,
+    target: TriSurface,
+    matched: tuple[Location, Array, Array] | None = None,
+    say: Callable[[str], None] = lambda _: None,
+) -> PressureFit:
+    """Pressures by a trust region on the distances between the lung's border and the target's, both ways.
+
+    matched: where landmarks lie in the lung (its own node numbers), their places (k, 3) at rest and in the target, for
+    the fit that sees them (E2). Each round costs one equilibrium, whose factor also yields all derivatives.
+    """
+    border = scene.lung.boundary
+    k = scene.patches
+    state = press(scene, np.zeros(k), np.zeros_like(scene.mesh.points))
+    residual, slope, mean = _distances(scene, border, target, state, matched)
+    history, damping, evaluations = [mean], 1e-2, 1
+    best, least, since = state, float(residual @ residual), 0
+    for _ in range(SURFACE_ROUNDS):
+        normal = slope.T @ slope
+        step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)) + 1e-9 * np.eye(k), -slope.T @ residual)
+        motion = state.by_pressure @ step
+        step = step * min(1.0, REACH_MM / max(float(np.linalg.norm(motion, axis=1).max()), 1e-9))
+        before = float(residual @ residual)
+        state = press(scene, state.p + step, state.u + state.by_pressure @ step)
+        evaluations += 1
+        residual, slope, mean = _distances(scene, border, target, state, matched)
+        # The walls slide on as contact follows them, so a round may well be dearer than the one before.
+        damping = damping / 3 if residual @ residual < before else damping * 5
+        if residual @ residual < 0.99 * least:
+            best, least, since = state, float(residual @ residual), 0
+            history.append(mean)
+            say(f"mean surface distance {mean:.2f} mm after {evaluations} equilibria")
+        else:
+            since += 1
+            if since == 3:
+                break
+    state = best
+    return PressureFit(state, tuple(history), evaluations)
+
+
+def _distances(
+    scene: Thorax,
+    border: TriSurface,
+    target: TriSurface,
+    state: Pressed,
+    matched: tuple[Location, Array, Array] | None,
+) -> tuple[Array, Array, float]:
+    """Residuals (q,), their derivatives (q, k) by the pressures, and the mean surface distance in mm."""
+    moved = border.moved(border.points + state.u[border.nodes])
+    there, back = closest_points(target, moved.points), closest_points(moved, target.points)
+    change = state.by_pressure[border.nodes]
+    at_back = np.einsum("qk,qkdp->qdp", back.barycentric, change[border.triangles[back.triangle]])
+    normal = np.concatenate([target.normals[there.triangle], target.node_normals])
+    gap = np.concatenate([moved.points - there.points, back.points - target.points])
+    root = np.sqrt(np.concatenate([moved.node_areas / moved.areas.sum(), target.node_areas / target.areas.sum()]) / 2)
+    along = np.einsum("qd,qd->q", gap, normal)
+    robust = 1 / np.sqrt(1 + (along / 20.0) ** 2)
+    slope = np.einsum("qd,qdp->qp", normal, np.concatenate([change, at_back]))
+    residual, slope = root * robust * along, (root * robust)[:, None] * slope
+    # Patches that the border hardly tells apart would run away against each other.
+    k = len(state.p)
+    residual = np.concatenate([residual, PRIOR_MM_PER_KPA * state.p])
+    slope = np.concatenate([slope, PRIOR_MM_PER_KPA * np.eye(k)])
+    mean = float(np.average(np.abs(there.distance), weights=moved.node_areas))
+    if matched is not None:
+        where, rest, goal = matched
+        off = rest + interpolate(where, state.u[: len(scene.lung.points)]) - goal
+        by = interpolate(where, state.by_pressure[: len(scene.lung.points)])
+        weight = 1 / np.sqrt(len(rest))
+        residual = np.concatenate([residual, weight * off.ravel()])
+        slope = np.concatenate([slope, weight * by.reshape(-1, by.shape[2])])
+    return residual, slope, mean
+
+
+def _contact(scene: Thorax, u: Array) -> Springs:
+    """Springs along the walls' normals that keep the gap at rest between lung and walls, wherever the lung slid to."""
+    border = scene.lung.boundary
+    walls = scene.walls.moved(scene.walls.points + u[scene.walls.nodes])
+    here = border.points + u[border.nodes]
+    near = closest_points(walls, here)
+    normal = walls.normals[near.triangle]
+    corners = walls.nodes[walls.triangles[near.triangle]]
+    rows = np.arange(len(here))
+    n = len(u)
+    operator = coo_matrix((np.ones(len(here)), (rows, border.nodes)), shape=(len(here), n)) - coo_matrix(
+        (near.barycentric.ravel(), (np.repeat(rows, 3), corners.ravel())), shape=(len(here), n)
+    )
+    operator = operator.tocsr()
+    apart = np.einsum("qd,qd->q", here - near.points, normal)
+    wanted = np.einsum("qd,qd->q", operator @ u, normal) + scene.gap - apart
+    # Where a wall is missing, between chest and diaphragm, the nearest one is none of the lung's.
+    area = border.moved(here).node_areas * (np.abs(scene.gap) < TOUCH_MM) * (np.abs(apart - scene.gap) < 2 * TOUCH_MM)
+    stiffness = STICK_KPA_PER_MM * area[:, None, None] * normal[:, :, None] * normal[:, None, :]
+    return Springs(*point_constraints(operator, stiffness, wanted[:, None] * normal))
+
+
+def _patch_forces(scene: Thorax, u: Array) -> Array:
+    """Nodal forces (n, 3, k) kPa mm2 per kPa of every patch, pulling the walls away from the lung."""
+    walls = scene.walls.moved(scene.walls.points + u[scene.walls.nodes])
+    forces = np.zeros((*u.shape, scene.patches))
+    for k in range(scene.patches):
+        chosen = scene.patch == k
+        # The walls' outward normal points into the lung.
+        pull = -walls.area_vectors[chosen] / 3
+        for corner in range(3):
+            np.add.at(forces[:, :, k], walls.nodes[walls.triangles[chosen, corner]], pull)
+    return forces
+
+
+def _walls(bodies: Sequence[TetMesh], starts: Array, lung: TetMesh, points: Array) -> tuple[TriSurface, Array]:
+    """Faces of the bodies that look at the lung, and the patch of each."""
+    triangles, is_below = [], []
+    for number, body in enumerate(bodies):
+        surface = body.boundary
+        middle = surface.points[surface.triangles].mean(axis=1)
+        near = closest_points(lung.boundary, middle)
+        facing = np.einsum("td,td->t", surface.normals, near.points - middle) > 0
+        chosen = (np.abs(near.distance) < 12.0) & facing
+        triangles.append(surface.nodes[surface.triangles[chosen]] + starts[1 + number])
+        is_below.append(np.full(int(chosen.sum()), number == 1))
+    all_, below = np.concatenate(triangles), np.concatenate(is_below)
+    nodes, local = np.unique(all_, return_inverse=True)
+    walls = TriSurface(points[nodes], local.reshape(-1, 3), nodes)
+    middle = walls.points[walls.triangles].mean(axis=1)
+    centre = np.average(lung.points, axis=0, weights=lung.node_volumes)
+    angle = np.arctan2(middle[:, 1] - centre[1], middle[:, 0] - centre[0])
+    sector = np.floor((angle + np.pi) / (2 * np.pi) * SECTORS).astype(int) % SECTORS
+    height = np.argsort(np.argsort(middle[:, 2])) * STOREYS // len(middle)
+    patch = sector + SECTORS * height
+    patch = np.where(below, SECTORS * STOREYS + (middle[:, 1] > centre[1]), patch)
+    _, patch = np.unique(patch, return_inverse=True)
+    return walls, patch
+
+
+def _anchors(bodies: Sequence[TetMesh], starts: Array, points: Array, pair: Lung, towards: float) -> csr_matrix:
+    """Springs that hold the chest, firmly at its back, and the far side of what is below."""
+    held = np.zeros(len(points))
+    chest, below = bodies
+    lung, side = pair.expired, pair.side
+    size = BODY.young_kpa * np.cbrt(chest.node_volumes)
+    inward = chest.points[:, 0] * (1.0 if side == "left" else -1.0)
+    firm = (chest.points[:, 1] < np.quantile(chest.points[:, 1], 0.12)) | (inward > np.quantile(inward, 0.85))
+    held[starts[1] : starts[2]] = ANCHOR * size * np.where(firm, 30.0, 1.0)
+    size = BODY.young_kpa * np.cbrt(below.node_volumes)
+    depth = towards * below.points[:, 2]
+    held[starts[2] : starts[3]] = ANCHOR * size * np.where(depth > np.quantile(depth, 0.7), 1.0, 0.1)
+    held[: starts[1]] = TETHER * LUNG.young_kpa * np.cbrt(lung.node_volumes) * _near_hilum(lung, side)
+    return diags(np.repeat(held, 3)).tocsr()
+
+
+def _near_hilum(lung: TetMesh, side: Side) -> Array:
+    """How near (n,) the lung's nodes lie to where bronchi and vessels tether it, 1 at the hilum."""
+    return np.exp(-(((lung.points - hilum(lung, side)) / HILUM_MM) ** 2).sum(axis=1)) + 1e-6
+
+
+def _elastic(mesh: TetMesh, kinds: Array) -> csr_matrix:
+    """Linear stiffness (3n, 3n) with the lung's moduli where kinds (m,) is 0 and those of the bodies elsewhere."""
+    eye = np.eye(3)
+    moduli = np.empty((2, 3, 3, 3, 3))
+    for kind, tissue in enumerate((LUNG, BODY)):
+        twice = np.einsum("ik,jl->ijkl", eye, eye) + np.einsum("il,jk->ijkl", eye, eye)
+        moduli[kind] = tissue.lame_kpa * np.einsum("ij,kl->ijkl", eye, eye) + tissue.shear_kpa * twice
+    return tangent_stiffness(mesh, moduli[kinds])
+
+
+def _largest(inside: Array) -> Array:
+    labels, count = ndimage.label(inside)
+    if count == 0:
+        return inside
+    size = np.bincount(labels.ravel())
+    size[0] = 0
+    return labels == np.argmax(size)

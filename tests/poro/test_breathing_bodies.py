@@ -1,0 +1,117 @@
+"""Quality of tetrahedra, the regional pressures and the body around the lung: by value and by sign."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from breathing_shapes import HALF, pear
+from numpy.testing import assert_allclose
+
+from poro.arrays import Array
+from poro.breathing.body import Body, body, border_motion, network
+from poro.breathing.elastic import WALL_ALONE, Lung
+from poro.breathing.mesh_quality import _slopes, quality, smooth, violations
+from poro.breathing.regional import Thorax, fit_pressures, press, thorax
+from poro.mesh import TetMesh, stuff
+
+REGULAR = np.array([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
+
+
+def test_a_regular_tetrahedron_has_quality_one_whatever_its_size() -> None:
+    tets = np.array([[0, 1, 2, 3]])
+    assert_allclose(np.abs(quality(7 * REGULAR, tets)), 1)
+    flat = REGULAR * [1, 1, 0.1]
+    assert abs(quality(flat, tets)[0]) < 0.6
+
+
+def test_the_slope_of_the_quality_is_its_derivative() -> None:
+    mesh = pear(25.0)
+    rng = np.random.default_rng(0)
+    direction = rng.normal(size=mesh.points.shape)
+    h = 1e-5
+    ahead, behind = (quality(mesh.points + t * direction, mesh.tets) for t in (h, -h))
+    _, slope = _slopes(mesh.points, mesh.tets)
+    assert_allclose((ahead - behind) / (2 * h), np.einsum("mki,mki->m", slope, direction[mesh.tets]), atol=1e-7)
+
+
+def test_descent_lifts_the_worst_element_and_leaves_the_surface() -> None:
+    mesh = pear(18.0)
+    better = smooth(mesh)
+    border = mesh.boundary.nodes
+    assert violations(better).worst > violations(mesh).worst
+    assert_allclose(better.points[border], mesh.points[border])
+    assert better.volumes.sum() == pytest.approx(mesh.volumes.sum())
+
+
+def ball_mask(margin: int = 6) -> tuple[Array, Array]:
+    step = 5.0
+    n = np.ceil(HALF / step).astype(int) + margin
+    x = step * np.stack(np.meshgrid(*(np.arange(-k, k + 1) for k in n), indexing="ij"), -1)
+    affine = np.diag([step, step, step, 1.0])
+    affine[:3, 3] = -step * n
+    return (np.linalg.norm(x / HALF, axis=-1) < 1) & (x[..., 2] > -30), affine
+
+
+@pytest.fixture(scope="module")
+def chest() -> tuple[Thorax, Lung]:
+    inside, affine = ball_mask()
+    expired, stretch = pear(20.0), np.array([1.04, 1.06, 1.05])
+    fixed = np.array([expired.points[:, 0].min(), expired.points[:, 1].min(), 0.0])  # inner side and back stay
+    inspired = TetMesh(fixed + stretch * (expired.points - fixed), expired.tets)
+    lung = Lung("right", inspired, expired)
+    return thorax(inside, affine, lung, WALL_ALONE), lung
+
+
+def test_pressures_pull_lung_and_wall_outward_and_their_derivative_is_what_they_do(chest: tuple[Thorax, Lung]) -> None:
+    scene, lung = chest
+    still = np.zeros_like(scene.mesh.points)
+    rest = press(scene, np.zeros(scene.patches), still, rounds=1)
+    p = np.full(scene.patches, 0.05)
+    found = press(scene, p, still, rounds=1)
+    assert_allclose(found.u - rest.u, rest.by_pressure @ p, atol=1e-9)
+    border = lung.expired.boundary
+    outward = np.einsum("nd,nd->n", found.u[border.nodes] - rest.u[border.nodes], border.node_normals)
+    assert np.average(outward, weights=border.node_areas) > 0.05
+    assert scene.patches >= 12
+
+
+def test_the_fit_brings_the_border_nearer_to_the_inspired_one(chest: tuple[Thorax, Lung]) -> None:
+    scene, lung = chest
+    fit = fit_pressures(scene, lung.inspired.boundary)
+    assert fit.history[-1] < 0.75 * fit.history[0]
+    assert fit.evaluations < 20
+
+
+@pytest.fixture(scope="module")
+def around() -> tuple[Body, TetMesh]:
+    inside, affine = ball_mask(margin=14)
+    shell = np.ones_like(inside)
+    shell[:3], shell[-3:], shell[:, :3], shell[:, -3:], shell[:, :, :3], shell[:, :, -3:] = (False,) * 6
+    mesh = stuff(shell & ~inside, affine, 26.0)
+    still = mesh.points[:, 1] < np.quantile(mesh.points[:, 1], 0.1)
+    lung = pear(20.0)
+    return body(mesh, np.zeros(len(mesh.points)), still, [lung.boundary]), lung
+
+
+def test_a_body_whose_lungs_rest_rests(around: tuple[Body, TetMesh]) -> None:
+    scene, _ = around
+    wanted = np.zeros((len(scene.near), 3))
+    assert_allclose(scene.follow(wanted), 0, atol=1e-12)
+    assert_allclose(network(scene, wanted)[0], 0, atol=1e-12)
+
+
+def test_a_sliding_lung_leaves_the_elastic_body_and_a_swelling_one_moves_it(around: tuple[Body, TetMesh]) -> None:
+    scene, lung = around
+    border = lung.boundary
+    swollen = border_motion([border], [0.1 * border.points], scene.mesh.points[scene.near])
+    u = scene.follow(swollen)
+    along = np.einsum("qd,qd->q", u[scene.near] - swollen, scene.normals)
+    assert np.abs(along).mean() < 0.2 * np.abs(np.einsum("qd,qd->q", swollen, scene.normals)).mean()
+    assert np.abs(u[scene.still]).max() < 0.3
+    tangent = swollen - np.einsum("qd,qd->q", swollen, scene.normals)[:, None] * scene.normals
+    slid = scene.follow(tangent)
+    assert np.linalg.norm(slid, axis=1).mean() < 0.05 * np.linalg.norm(u, axis=1).mean()
+    by_springs, steps = network(scene, swollen)
+    assert steps <= 500
+    assert np.abs(by_springs[scene.still]).max() == 0
+    assert np.linalg.norm(by_springs - u, axis=1).mean() < np.linalg.norm(u, axis=1).mean()

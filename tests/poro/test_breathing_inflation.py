@@ -1,0 +1,105 @@
+"""Lungs filled to a volume: closed-form suction, the cavity, the pressure-volume curve, one scan."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from breathing_shapes import pear
+from numpy.testing import assert_allclose
+from scipy.sparse import diags
+
+from poro.breathing.cavity import inflating
+from poro.breathing.elastic import WALL_ALONE, Lung
+from poro.breathing.equilibrium import Balance, Scene, Springs, balance, volume
+from poro.breathing.inflation import fill, fill_to
+from poro.breathing.one_scan import one_scan, regions
+from poro.breathing.pressure_volume import PER_PA, inspired_volume, pressure_volume
+from poro.fem import Tissue, neo_hookean
+from poro.mesh import TetMesh
+
+TISSUE = Tissue()
+
+
+def free_scene(mesh: TetMesh, suction_kpa: float = 0.0) -> Scene:
+    anchor = diags(np.full(3 * len(mesh.points), 1e-7)).tocsr()
+    return Scene(mesh, neo_hookean(TISSUE), Springs(anchor, np.zeros_like(mesh.points)), suction_kpa)
+
+
+def suction(s: float) -> float:
+    """Of a neo-Hookean body that swells freely by s: mu (s^2 - 1) / s^3 + 3 lambda ln s / s^3."""
+    return (TISSUE.shear_kpa * (s**2 - 1) + 3 * TISSUE.lame_kpa * np.log(s)) / s**3
+
+
+@pytest.mark.parametrize("s", [0.9, 1.12])
+def test_a_free_lung_swells_evenly_under_its_closed_form_suction(s: float) -> None:
+    mesh = pear()
+    found = fill_to(free_scene(mesh), s**3 * float(mesh.volumes.sum()), (s - 1) * mesh.points * 0.5)
+    reached = np.cbrt(found.volume_mm3 / mesh.volumes.sum())
+    assert reached == pytest.approx(s, abs=0.01)
+    assert (found.suction_kpa > 0) == (s > 1)
+    assert found.suction_kpa == pytest.approx(suction(reached), rel=0.02)
+    shift = found.u - (reached - 1) * mesh.points
+    assert_allclose(shift - shift.mean(axis=0), 0, atol=0.1)
+
+
+def test_balance_under_a_given_suction_is_the_same_swelling() -> None:
+    mesh, s = pear(), 1.1
+    found = balance(free_scene(mesh, suction(s)), (s - 1) * mesh.points * 0.9, tolerance=1e-7)
+    assert found.balance is Balance.BALANCED
+    assert volume(mesh, found.u) / mesh.volumes.sum() == pytest.approx(s**3, rel=1e-4)
+    assert found.residuals[-1] < 1e-7
+
+
+def test_a_lung_fills_its_cavity_and_stays_within() -> None:
+    expired, inspired = pear(), pear(stretch=np.array([1.05, 1.1, 1.15]))
+    scene = inflating(Lung("right", inspired, expired), WALL_ALONE)
+    phases = list(fill(scene.at, [0.5, 1.0], scene.volume, scene.guess))
+    for share, phase in zip((0.5, 1.0), phases, strict=True):
+        assert phase.volume_mm3 == pytest.approx(scene.volume(share), rel=0.02)
+    wall = scene.cavity.level.evaluate(expired.points + phases[-1].u)[0]
+    assert wall.min() > -3.0
+    assert phases[1].suction_kpa > phases[0].suction_kpa > 0
+    top, bottom = expired.points[:, 2] > 40, expired.points[:, 2] < -20
+    assert phases[-1].u[top, 2].mean() > 2 > -2 > phases[-1].u[bottom, 2].mean()
+
+
+def test_the_pressure_volume_curve_runs_both_ways_and_starts_with_its_compliance() -> None:
+    inspired = np.linspace(0, 500, 11)
+    pressure = pressure_volume(inspired, 2400.0)
+    compliance = 200 / 98.07
+    assert pressure[0] == 0
+    assert (np.diff(pressure, 2) > 0).all()
+    assert pressure[1] == pytest.approx(50 / compliance, rel=0.05)
+    assert_allclose(inspired_volume(pressure, 0.083 / 98.07 * 2400), inspired, rtol=1e-9)
+    assert PER_PA * pressure_volume(np.array([0.0, 9000.0]), 2400.0)[1] == pytest.approx(-np.log(0.05))
+
+
+@pytest.mark.parametrize("feet", [-1.0, 1.0])
+def test_apex_spine_and_diaphragm_lie_where_they_should(feet: float) -> None:
+    mesh = pear(14.0)
+    if feet > 0:
+        mesh = TetMesh(mesh.points * [-1, 1, -1], mesh.tets)
+    surface = mesh.boundary
+    where = regions(surface, "right", feet)
+    up = -feet * surface.points[:, 2]
+    assert up[where.diaphragm].max() < -15
+    assert where.diaphragm.sum() > 20
+    assert up[where.apex].min() > 50
+    assert (surface.points[where.spine, 0] < 0).all()  # the right lung's inner side
+    assert (surface.points[where.flank, 0] > 0).all()
+    assert not (where.diaphragm & where.spine).any()
+
+
+def test_a_breath_of_one_scan_lowers_the_diaphragm_and_keeps_the_apex() -> None:
+    mesh = pear(18.0)
+    scene = one_scan(mesh, "right")
+    rest = float(mesh.volumes.sum())
+    filled, emptied = scene.states([1.15 * rest])[0], scene.states([0.85 * rest])[0]
+    nodes = mesh.boundary.nodes
+    for found, share in ((filled, 1.15), (emptied, 0.85)):
+        assert found.volume_mm3 == pytest.approx(share * rest, rel=0.02)
+        assert np.abs(found.u[nodes[scene.regions.apex]]).max() < 0.5
+    down = filled.u[nodes[scene.regions.diaphragm], 2].mean()
+    assert down < -1
+    assert emptied.u[nodes[scene.regions.diaphragm], 2].mean() > 1
+    assert filled.suction_kpa > 0 > emptied.suction_kpa

@@ -1,0 +1,80 @@
+"""Driver `pressure-volume`: the expired lung is inflated inside the inspired cavity, phase by phase. Ref: Eom 2010.
+
+The suction follows the volume: at every phase the lung has the phase's volume, and its tissue's stiffness is set by one
+number, so that at the end of inspiration the suction is what the pressure-volume curve says.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from poro.arrays import Array
+from poro.breathing.cavity import Inflating, inflating
+from poro.breathing.elastic import acting_at
+from poro.breathing.inflation import fill
+from poro.breathing.mesh_quality import Shares, smooth, violations
+from poro.breathing.pressure_volume import pressure_volume
+from vatsloc.breathing.case import BreathCase
+from vatsloc.breathing.lungs import both_scans
+from vatsloc.breathing.motion import IN, LungMotion, Motion, between, shares
+
+EDGE_MM = 16.0
+EQUILIBRIA = 5
+"""How many are computed; phases between lie on a line from one to the next."""
+FULL = 0.99
+"""Share of the way to the inspired volume at which the lung stops: corners of the cavity it would only fill at any
+suction."""
+
+
+def drive(case: BreathCase, count: int, say: Callable[[str], None]) -> Motion:
+    """From expiration to inspiration in `count` phases of equal volume steps."""
+    pairs, notes = both_scans(case, EDGE_MM)
+    progress = shares(count)
+    knots = shares(min(count, EQUILIBRIA + 1))
+    lungs, suctions, quality = [], [], []
+    for pair in pairs:
+        say(f"{pair.side} lung: {len(knots) - 1} equilibria of its inflation ...")
+        scene = inflating(pair.lung, acting_at(pair.depth))
+        found = list(fill(scene.at, knots[1:].tolist(), partial(_volume, scene), scene.guess))
+        u = np.stack([np.zeros_like(scene.mesh.points), *(phase.u for phase in found)])
+        states = tuple(scene.mesh.points + between(u, knots, s) for s in progress)
+        lungs.append(LungMotion(pair.side, scene.mesh, states))
+        suctions.append(np.interp(progress, knots, [0.0, *(1000 * phase.suction_kpa for phase in found)]))
+        quality.append((pair.side, violations(scene.mesh), violations(smooth(scene.mesh))))
+        if not all(phase.settled for phase in found):
+            slow = sum(not phase.settled for phase in found)
+            notes.append(f"{pair.side} lung: {slow} of {len(knots) - 1} equilibria still moved by over 0.3 mm a step.")
+    by_tissue = np.mean(suctions, axis=0)
+    volumes = np.array([sum(lung.volume_ml(n) for lung in lungs) for n in range(count)])
+    curve = pressure_volume(volumes - volumes[0], volumes[0])
+    stiffness = float(curve[-1] / by_tissue[-1]) if by_tissue[-1] > 0 else 1.0
+    details: dict[str, Any] = {
+        "stiffness_ratio": stiffness,
+        "tables": [_pressures(volumes, curve, stiffness * by_tissue), _quality(quality)],
+    }
+    pressure = tuple(float(p) for p in stiffness * by_tissue)
+    return Motion("pressure-volume", IN, tuple(lungs), pressure, count - 1, tuple(notes), details)
+
+
+def _volume(scene: Inflating, share: float) -> float:
+    return scene.volume(FULL * share)
+
+
+def _pressures(volumes: Array, curve: Array, tissue: Array) -> dict[str, Any]:
+    rows = [
+        [n, f"{v:.0f}", f"{c:.0f}", f"{t:.0f}"] for n, (v, c, t) in enumerate(zip(volumes, curve, tissue, strict=True))
+    ]
+    return {"title": "Pressure and volume", "head": ["phase", "ml", "curve, Pa", "tissue, Pa"], "rows": rows}
+
+
+def _quality(lungs: Sequence[tuple[str, Shares, Shares]]) -> dict[str, Any]:
+    rows = []
+    for side, before, after in lungs:
+        for name, shares_ in (("as stuffed", before), ("after descent on V / L^3", after)):
+            rows.append([f"{side}, {name}", *(f"{100 * share:.1f} %" for share in shares_)])
+    head = ["mesh", "Jacobian < 0.9", "aspect > 2", "angle > 80", "angle < 50", "worst V / L^3"]
+    return {"title": "Elements beyond the limits of Eom's table II", "head": head, "rows": rows}
