@@ -153,14 +153,14 @@ def _to_the_scan(motion: Motion, followed: Followed, grid: Grid, n: int) -> tupl
     density = np.ones(grid.shape, np.float32)
     for lung in motion.lungs:
         there = TetMesh(lung.states[n], lung.mesh.tets)
-        inner = sampled(MeshMap(there, lung.mesh.points, identity), grid, beyond=False)
+        inner = sampled(MeshMap(there, lung.mesh.points, identity), grid, beyond_mm=0.0)
         inside = covered(there, grid).inside
         vectors[inside] = inner.vectors[inside]
         weight = np.bincount(lung.mesh.tets.ravel(), np.repeat(there.volumes, 4), len(there.points))
         ratio = np.bincount(lung.mesh.tets.ravel(), np.repeat(lung.mesh.volumes, 4), len(there.points)) / weight
         # A point that moves to (r, r, r) carries a number as a map carries a place.
         carrier = MeshMap(there, there.points + ratio[:, None], identity)
-        density[inside] = sampled(carrier, grid, beyond=False).vectors[inside][:, 0]
+        density[inside] = sampled(carrier, grid, beyond_mm=0.0).vectors[inside][:, 0]
     return DisplacementField(vectors.astype(np.float32), grid.ras_from_ijk), density
 
 
@@ -169,7 +169,7 @@ def _to_the_state(motion: Motion, followed: Followed, grid: Grid, n: int) -> Dis
     identity = RigidTransform.identity()
     vectors = np.array(sampled(MeshMap(followed.body.mesh, followed.nodes[n], identity), grid).vectors)
     for lung in motion.lungs:
-        inner = sampled(MeshMap(lung.mesh, lung.states[n], identity), grid, beyond=False)
+        inner = sampled(MeshMap(lung.mesh, lung.states[n], identity), grid, beyond_mm=0.0)
         inside = covered(lung.mesh, grid).inside
         vectors[inside] = inner.vectors[inside]
     return DisplacementField(vectors.astype(np.float32), grid.ras_from_ijk)
