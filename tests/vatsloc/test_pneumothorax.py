@@ -223,4 +223,4 @@ def test_the_collapse_is_made_of_what_was_observed(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(module, "observe", lambda *values: ("observed", *values))
     monkeypatch.setattr(module, "collapse", lambda *values: values)
     case, prepared, pose, settings, stages = words
-    assert pneumothorax(*words) == (case, prepared, pose, ("observed", *words), settings, stages)
+    assert pneumothorax(*words) == (case, prepared, pose, ("observed", *words, None), settings, stages)
