@@ -55,11 +55,11 @@ def stuff_pieces(
     Raises ValueError where a piece is too thin to hold an element.
     """
     level, lower, upper = mask_level(inside, ras_from_ijk, edge_mm)
-    parts = [
-        stuff_level_set(lambda x, sign=sign: np.minimum(level(x), sign * side(x)), lower, upper, edge_mm)
-        for sign in (1.0, -1.0)
-    ]
-    first, second = parts
+
+    def one_side(sign: float) -> Callable[[Array], Array]:
+        return lambda points: np.minimum(level(points), sign * side(points))
+
+    first, second = (stuff_level_set(one_side(sign), lower, upper, edge_mm) for sign in (1.0, -1.0))
     far, twin = cKDTree(first.points).query(second.points, distance_upper_bound=SAME_MM)
     same = np.isfinite(far)
     shared = same & joined(second.points)
