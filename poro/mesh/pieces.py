@@ -55,10 +55,11 @@ def stuff_pieces(
     Raises ValueError where a piece is too thin to hold an element.
     """
     level, lower, upper = mask_level(inside, ras_from_ijk, edge_mm)
-    first, second = (
-        stuff_level_set(half, lower, upper, edge_mm)
-        for half in (lambda x: np.minimum(level(x), side(x)), lambda x: np.minimum(level(x), -side(x)))
-    )
+
+    def one_side(sign: float) -> Callable[[Array], Array]:
+        return lambda points: np.minimum(level(points), sign * side(points))
+
+    first, second = (stuff_level_set(one_side(sign), lower, upper, edge_mm) for sign in (1.0, -1.0))
     far, twin = cKDTree(first.points).query(second.points, distance_upper_bound=SAME_MM)
     same = np.isfinite(far)
     shared = same & joined(second.points)

@@ -118,7 +118,12 @@ def _fitted(
 ) -> tuple[ChangeOfPose, Collapse] | None:
     """The collapse in pieces, without its residual registration; None where it predicts no better."""
     observed, model, found = collapse.observed, collapse.model, collapse.model.correspondences
-    fine, coarse = (cut_lung(prepared, fissure, edge) for edge in (settings.mesh.edge_mm, settings.mesh.model_edge_mm))
+    try:
+        fine, coarse = (
+            cut_lung(prepared, fissure, edge) for edge in (settings.mesh.edge_mm, settings.mesh.model_edge_mm)
+        )
+    except ValueError:  # a piece too thin for its elements
+        return None
     placed = MeshMap(pose.mesh_ct, collapse.mesh_before.points, collapse.def_from_inf_rigid @ pose.inf_from_ct_rigid)
     rest = TetMesh(placed(coarse.mesh.points), coarse.mesh.tets)
     in_ct = interpolate(locate(collapse.mesh_before, found.moving), pose.mesh_ct.points)
