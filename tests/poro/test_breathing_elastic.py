@@ -74,7 +74,8 @@ def test_weight_moves_the_inside_to_the_back_and_hardly_the_wall(still: Lung) ->
     wall = still.inspired.boundary
     density = 0.1e9 / still.expired.volumes.sum()
     column = density * GRAVITY_KPA_PER_MM * (2 * HALF[1]) ** 2 / (8 * (Tissue().lame_kpa + 2 * Tissue().shear_kpa))
-    assert u[depth(still.inspired) > 0.8, 1].mean() == pytest.approx(-column, rel=0.25)
+    # The sides of the wall hold the middle too, so it sinks less than a column between front and back alone.
+    assert 0.6 * column < -u[depth(still.inspired) > 0.8, 1].mean() < column
     assert u[inside, 1].max() < 0
     assert np.abs(np.einsum("nd,nd->n", u[wall.nodes], wall.node_normals)).max() < 1.0
     twice = breathe_out(still, replace(weight, mass_kg=0.2)) - still.inspired.points

@@ -66,12 +66,14 @@ def test_whatever_a_stage_raises_ends_by_a_code_and_a_sentence_and_leaves_nothin
 ) -> None:
     block, code, sentence = KINDS[kind]
 
-    def localize(_case: object, _settings: object, stages: Stages) -> None:
+    def localize(_case: object, _settings: object, stages: Stages, *_rest: object) -> None:
         with stages.stage("deflated surface", DEFLATED):
             if inside:
                 block()
         block()
 
+    file = SimpleNamespace(images=SimpleNamespace(cbct_inflated="inflated.nii.gz"))
+    monkeypatch.setattr(workflow_run, "read_case_file", lambda _folder: file)
     monkeypatch.setattr(workflow_run, "read_case", lambda _folder: SimpleNamespace(warnings=()))
     monkeypatch.setattr(workflow_run, "localize", localize)
     with pytest.raises(SystemExit) as stop:

@@ -125,7 +125,7 @@ def test_a_solved_and_a_fitted_lung_are_the_same() -> None:
     mixed = np.random.default_rng(15).permutation(len(hilum))
     system = assemble(BALL, Tissue(), GRAVITY, hilum, shift)
     other = assemble(SHUFFLED, Tissue(), GRAVITY, PLACE[hilum][mixed], shift[mixed])
-    theta = Theta(2e-8, 0.7, 3.0)
+    theta = Theta(2e-8, 0.7, 0.0)  # a ball has no principal axis of its own that a diaphragm could move along
     state, again = solve(system, theta), solve(other, theta)
     assert_allclose(state.u[hilum], shift, atol=1e-9)
     assert_allclose(again.u, state.u[ORDER], atol=2e-3)

@@ -134,7 +134,7 @@ def test_every_preset_has_all_parts_switched_on(preset: str) -> None:
     switches = {f"{name}.{key}": value for name, table in tables.items() for key, value in table.items()}
     switches = {name: value for name, value in switches.items() if isinstance(value, bool)}
     assert set(switches) == {
-        *("registration.on", "keypoints.on", "residual.on"),
+        *("registration.on", "keypoints.on", "residual.on", "refinement.on"),
         *("model.hilum", "model.diaphragm", "model.regional", "model.correct"),
     }
     assert all(switches.values())
