@@ -41,12 +41,14 @@ def _bodies(pieces: Pieces) -> int:
 def test_a_cut_ball_keeps_its_volume_and_has_no_slivers() -> None:
     whole, pieces = stuff(*_ball(), EDGE_MM), _cut(0.0)
     assert pieces.mesh.volumes.min() > 0
-    lost = whole.volumes.sum() - pieces.mesh.volumes.sum()
-    rim = 2 * np.pi * np.sqrt(RADIUS_MM**2 - 16)
-    assert 0 < lost < 0.5 * EDGE_MM**2 * rim  # the lattice rounds the sharp rim of the cut
+    rim_mm = 2 * np.pi * np.sqrt(RADIUS_MM**2 - 16)
+    rounded = 0.5 * EDGE_MM**2 * rim_mm  # the lattice rounds the sharp rim of the cut
+    assert 0 < whole.volumes.sum() - pieces.mesh.volumes.sum() < rounded
     assert quality(pieces.mesh).min_dihedral > 12
-    cap = np.pi * (RADIUS_MM - 4) ** 2 * (2 * RADIUS_MM + 4) / 3
-    assert pieces.mesh.volumes[pieces.piece == 0].sum() == pytest.approx(cap, rel=0.06)
+    above = (RADIUS_MM - 4) ** 2 * (2 * RADIUS_MM + 4) / (4 * RADIUS_MM**3)  # a cap's share of the ball
+    for number, share in ((0, above), (1, 1 - above)):
+        lost = share * whole.volumes.sum() - pieces.mesh.volumes[pieces.piece == number].sum()
+        assert 0 < lost < rounded
 
 
 def test_nodes_of_the_cut_are_two_at_one_place_and_lie_on_the_sheet() -> None:

@@ -129,7 +129,7 @@ def test_a_solved_and_a_fitted_lung_are_the_same() -> None:
     state, again = solve(system, theta), solve(other, theta)
     assert_allclose(state.u[hilum], shift, atol=1e-9)
     assert_allclose(again.u, state.u[ORDER], atol=2e-3)
-    assert_allclose(sensitivity(other, again), sensitivity(system, state)[ORDER], atol=0.05)
+    assert_allclose(sensitivity(other, again)[..., :2], sensitivity(system, state)[ORDER, :, :2], atol=0.05)
     settings = FitSettings(max_steps=4)
     one, two = (fit_collapse(lung, target_of(state.u), settings) for lung in (system, other))
     assert_allclose(two.theta.vector(), one.theta.vector(), atol=0.05)
