@@ -13,12 +13,12 @@ from poro.mesh import (
     interpolate,
     locate,
     patches,
-    principal_axis,
     quality,
     stuff,
     stuff_level_set,
     surface,
 )
+from poro.mesh.patches import principal_axis
 from poro.mesh.tetmesh import dihedral_angles
 
 
