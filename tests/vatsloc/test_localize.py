@@ -112,7 +112,8 @@ def test_run_holds_the_agreed_keys(run: dict[str, Any]) -> None:
     assert run["gates"]["nodule_in_view"]["value"] == 0
     layer = f"The pressure layer, {Tissue().layer_mm(run['theta']['kappa_b']):.1f} mm, "
     assert run["residuals"]["fit"]["pressure_layer"].startswith(layer)
-    stages = {name: seconds for name, seconds in run["seconds"].items() if name != "total"}
+    stages = {name: seconds for name, seconds in run["seconds"].items() if name not in ("total", "answer")}
+    assert stages["fit"] < run["seconds"]["answer"] < run["seconds"]["total"]
     assert run["seconds"]["total"] >= 0.9 * sum(stages.values())
     longest_first = run["nodule_ellipsoid95_mm"]
     assert longest_first == sorted(longest_first, reverse=True)

@@ -32,7 +32,7 @@ class Scene:
 
     @property
     def pose(self) -> Any:
-        return SimpleNamespace(mesh_inf=self.mesh, points_inf=self.mesh.points)
+        return SimpleNamespace(mesh_inf=self.mesh, points_inf=self.mesh.points, rigid=object())
 
     @property
     def collapse(self) -> Any:
