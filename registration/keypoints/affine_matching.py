@@ -17,6 +17,9 @@ from registration.kernels.trilinear import value
 from registration.keypoints.matching import FLAT_HU, subvoxel_peak
 from registration.volume import Array
 
+RADIUS = 3
+WIDTH = 2 * RADIUS + 1
+"""Of a block, voxels; known when kernels are compiled, or they are five times slower."""
 LEAST_INSIDE = 0.35
 """Share of a block's voxels that have to lie inside in both images."""
 LEAST_NCC = 0.3
@@ -42,13 +45,6 @@ class BlockMatches:
     round_trip: Array
 
 
-class _Search(NamedTuple):
-    """radius: of a block; reach: how far shifts go; both in voxels."""
-
-    radius: int
-    reach: int
-
-
 class _Best(NamedTuple):
     """What the search fills: shift, back: (n, 3) best shifts there and back; around: (n, 27) scores about the first."""
 
@@ -58,7 +54,7 @@ class _Best(NamedTuple):
 
 
 def match_affine_blocks(
-    fixed: MaskedImage, moving: MaskedImage, starts: Array, affines: Array, radius: int, reach: int
+    fixed: MaskedImage, moving: MaskedImage, starts: Array, affines: Array, reach: int
 ) -> BlockMatches:
     """The blocks about voxels `starts` (n, 3) of a fixed image in a moving one, up to `reach` voxels from where they
     are expected.
@@ -72,7 +68,7 @@ def match_affine_blocks(
         _centred(moving),
         np.ascontiguousarray(starts, np.int64),
         np.ascontiguousarray(affines, float),
-        _Search(radius, reach),
+        reach,
         best,
     )
     offset, is_peak = subvoxel_peak(best.around)
@@ -111,43 +107,84 @@ def _warped(moving, affine, half):
 
 
 @njit(cache=True)
-def _correlation(block, image, a, b, c):
-    """NCC of a block with the one of an image whose first voxel is (a, b, c), over voxels that count in both; -1 where
-    those are few or show nothing.
+def _correlate(taps, image, side, sums):
+    """Adds to sums (n, m) what a block of `taps` gives, multiplied with a flat image of `side` voxels an axis, at every
+    shift: plane by plane, a plane's rows one after the other.
+
+    Shifts are worked on side by side in the processor, which a loop over the block's voxels inside would prevent: five
+    times faster.
     """
-    width, n = block.hu.shape[0], 0
-    f, m, ff, mm, fm = np.float32(0), np.float32(0), np.float32(0), np.float32(0), np.float32(0)
-    for p in range(width):
-        for q in range(width):
-            for r in range(width):
-                if block.inside[p, q, r] and image.inside[a + p, b + q, c + r]:
-                    u, v = block.hu[p, q, r], image.hu[a + p, b + q, c + r]
-                    n += 1
-                    f += u
-                    m += v
-                    ff += u * u
-                    mm += v * v
-                    fm += u * v
-    if n < LEAST_INSIDE * width**3:
-        return np.float32(-1)
-    flat = np.float32(FLAT_HU**2)
-    return coefficient(n, f, m, ff, mm, fm, flat, flat)
+    for p in range(sums.shape[0]):
+        total = sums[p]
+        for a in range(WIDTH):
+            for b in range(WIDTH):
+                row, first = taps[a, b], ((p + a) * side + b) * side
+                values = image[first : first + total.shape[0] + WIDTH - 1]
+                for t in range(total.shape[0]):
+                    part = np.float32(0)
+                    for c in range(WIDTH):
+                        part += row[c] * values[t + c]
+                    total[t] += part
+
+
+@njit(cache=True)
+def _add_up(image, side, sums):
+    """The same for a block of ones, axis by axis."""
+    rows = np.zeros(image.shape[0], np.float32)
+    for t in range(image.shape[0] - WIDTH + 1):
+        for c in range(WIDTH):
+            rows[t] += image[t + c]
+    planes = np.zeros(image.shape[0], np.float32)
+    for t in range(image.shape[0] - (WIDTH - 1) * side):
+        for b in range(WIDTH):
+            planes[t] += rows[t + b * side]
+    for p in range(sums.shape[0]):
+        for a in range(WIDTH):
+            first = (p + a) * side * side
+            for t in range(sums.shape[1]):
+                sums[p, t] += planes[first + t]
 
 
 @njit(cache=True)
 def _scores(block, image, first, reach):
-    """NCC (2 reach + 1, ...) at every shift about the voxel `first` (3,) of an image, and the shift (3,) of the
-    best.
+    """NCC (2 reach + 1, ...) of a block at every shift about the voxel `first` (3,) of an image, over voxels that count
+    in both, -1 where those are few or show nothing, and the shift (3,) of the best.
     """
-    n, middle = 2 * reach + 1, block.hu.shape[0] // 2
+    n = 2 * reach + 1
+    side = n + WIDTH - 1
+    near = _block(image, first - reach, side)
+    one, counts = block.inside.astype(np.float32), near.inside.astype(np.float32)
+    f, flat_n, flat_m = block.hu * one, counts.ravel(), (near.hu * counts).ravel()
+    sums = np.zeros((6, n, (n - 1) * side + n), np.float32)
+    if block.inside.all():
+        _add_up(flat_n, side, sums[0])
+        _add_up(flat_m, side, sums[2])
+        _add_up(flat_m * flat_m, side, sums[4])
+    else:
+        _correlate(one, flat_n, side, sums[0])
+        _correlate(one, flat_m, side, sums[2])
+        _correlate(one, flat_m * flat_m, side, sums[4])
+    if near.inside.all():
+        sums[1], sums[3] = f.sum(), (f * f).sum()
+    else:
+        _correlate(f, flat_n, side, sums[1])
+        _correlate(f * f, flat_n, side, sums[3])
+    _correlate(f, flat_m, side, sums[5])
+    return _coefficients(sums, near.inside, reach)
+
+
+@njit(cache=True)
+def _coefficients(sums, inside, reach):
+    """What `_scores` returns, from the sums (6, n, m) of `coefficient`. inside: what of the image searched counts."""
+    n, flat = 2 * reach + 1, np.float32(FLAT_HU**2)
     scores, top, best = np.full((n, n, n), np.float32(-1)), np.float32(-1), np.zeros(3, np.int64)
     for p in range(n):
         for q in range(n):
             for r in range(n):
-                a, b, c = first[0] + p - reach, first[1] + q - reach, first[2] + r - reach
-                if not image.inside[a + middle, b + middle, c + middle]:
+                known, f, m, ff, mm, fm = sums[:, p, q * inside.shape[0] + r]
+                if not inside[p + RADIUS, q + RADIUS, r + RADIUS] or known < LEAST_INSIDE * WIDTH**3:
                     continue
-                scores[p, q, r] = _correlation(block, image, a, b, c)
+                scores[p, q, r] = coefficient(known, f, m, ff, mm, fm, flat, flat)
                 if scores[p, q, r] > top:
                     top = scores[p, q, r]
                     best[0], best[1], best[2] = p - reach, q - reach, r - reach
@@ -165,15 +202,14 @@ def _block(image, first, width):
 
 
 @njit(cache=True)
-def _match(fixed, moving, start, affine, search, shift, around, back):
+def _match(fixed, moving, start, affine, reach, shift, around, back):
     """One block of `match_affine_blocks`."""
-    radius, reach = search.radius, search.reach
-    width, half = 2 * radius + 1, radius + reach
+    half = RADIUS + reach
     for m in range(3):
         if start[m] < half or start[m] >= fixed.hu.shape[m] - half:
             return
-    block = _block(fixed, start - radius, width)
-    if block.inside.sum() < LEAST_INSIDE * width**3:
+    block = _block(fixed, start - RADIUS, WIDTH)
+    if block.inside.sum() < LEAST_INSIDE * WIDTH**3:
         return
     cube = _warped(moving, affine, half)
     middle = np.full(3, reach)
@@ -183,10 +219,10 @@ def _match(fixed, moving, start, affine, search, shift, around, back):
         return
     shift[:] = best
     around[:] = scores[a - 1 : a + 2, b - 1 : b + 2, c - 1 : c + 2].copy().ravel()
-    back[:] = _scores(_block(cube, middle + best, width), fixed, start - radius, reach)[1]
+    back[:] = _scores(_block(cube, middle + best, WIDTH), fixed, start - RADIUS, reach)[1]
 
 
 @njit(cache=True, parallel=True)
-def _match_all(fixed, moving, starts, affines, search, best):
+def _match_all(fixed, moving, starts, affines, reach, best):
     for n in prange(starts.shape[0]):
-        _match(fixed, moving, starts[n], affines[n], search, best.shift[n], best.around[n], best.back[n])
+        _match(fixed, moving, starts[n], affines[n], reach, best.shift[n], best.around[n], best.back[n])

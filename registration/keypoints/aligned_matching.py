@@ -37,13 +37,12 @@ LinearizedMap = Callable[[Array], Linearized]
 
 @dataclass(frozen=True)
 class AlignedSettings:
-    """radius: of a block, voxels of the fixed image; reach_mm: how far along each axis of it the map may be off;
-    least_ncc: of two blocks; round_trip_mm: how far from its start the way there and back may end; neighbours,
-    outlier_mm: how far a match may depart from the median correction of those about it.
+    """reach_mm: how far along each axis of the fixed image the map may be off; least_ncc: of two blocks; round_trip_mm:
+    how far from its start the way there and back may end; neighbours, outlier_mm: how far a match may depart from the
+    median correction of those about it.
     """
 
     reach_mm: float
-    radius: int = 3
     least_ncc: float = 0.6
     round_trip_mm: float = 1.5
     neighbours: int = 8
@@ -88,7 +87,6 @@ def match_aligned(
         _within(moving, regions.moving),
         starts,
         affines,
-        settings.radius,
         round(settings.reach_mm / voxel),
     )
     holds = (found.ncc >= settings.least_ncc) & (found.round_trip * voxel <= settings.round_trip_mm)

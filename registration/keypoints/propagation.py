@@ -86,7 +86,6 @@ def propagate_matches(
             there,
             starts[proposals.keypoint],
             _in_voxels(moving.grid, moving_from_voxel, proposals.moving),
-            match.radius,
             round(settings.reach_mm / match.voxel_mm),
         )
         holds = (found.ncc >= match.least_ncc) & (found.round_trip * grid.spacing.max() <= match.round_trip_mm)

@@ -183,7 +183,6 @@ def test_a_block_found_by_chance_does_not_lead_back() -> None:
         MaskedImage(lonely.astype(np.float32), whole),
         start,
         affines,
-        3,
         5,
     )
     assert found.ncc[0] > 0.5

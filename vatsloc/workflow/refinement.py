@@ -30,14 +30,14 @@ PASSES = ((1.5, 6.0), (1.0, 3.0))
 """Voxels of the blocks and how far they are looked for, mm, pass by pass."""
 MARGIN_MM = 16.0
 """What is kept of a scan about the lung: more than a block and its search reach."""
-RIM_MM = 2.5
+RIM_MM = 2.0
 """What is cut off the lung in both images: nearer than this to its border, voxels also show what lies beyond."""
-SIGMA_MM, STRAIN = 1.0, 0.007
+SIGMA_MM, STRAIN = 1.0, 0.01
 """Standard deviation of a block's position, and how far tissue gives way to it (`elastic_correction`)."""
 ANCHOR_SIGMA_MM = 0.2
 """Standard deviation of nodes that other evidence has placed."""
-ROUNDS = 4
-"""How often nodes of elements that would turn over are held before the lung stays as it was."""
+HALVINGS = 20
+"""Steps by which nodes of elements that would turn over follow less; in the second half they stay where they are."""
 APART_MM = 15.0
 """Blocks are held out by cubes this wide: they are dense, and what they tell does not reach far."""
 
@@ -83,29 +83,38 @@ class Pass:
 
 @dataclass(frozen=True)
 class BlockRefinement:
-    """A lung that followed blocks. points: (n, 3) mm, its nodes in the scan; passes: what each found and did."""
+    """A lung that followed blocks. points: (n, 3) mm, its nodes in the scan; passes: what each found and did; followed:
+    the blocks that it followed in the end, from the CT (`moving`) to the scan (`fixed`), None where it did not.
+    """
 
     points: Array
     passes: tuple[Pass, ...]
+    followed: Correspondences | None = None
 
 
 def refine_by_blocks(compared: Compared, shape: Shape, settings: RefinementSettings) -> BlockRefinement:
-    """Nodes of a lung moved to where small blocks of the CT are found in a scan; as they were where none judge well."""
+    """Nodes of a lung moved to where small blocks of the CT are found in a scan; as they were where none judge well.
+
+    Until the last pass held-out blocks are not followed, then all are, from what the passes before left.
+    """
     around = _around(compared)
-    starts = _starts(around, settings.cell_mm)
+    starts = _starts(around, shape, settings.cell_mm)
     passes: list[Pass] = []
+    trial, answer = shape, None
     for voxel_mm, reach_mm in PASSES:
-        matches = _blocks(around, starts, shape.map, voxel_mm, reach_mm)
+        matches = _blocks(around, starts, trial.map, voxel_mm, reach_mm)
         matches = matches.only(_depth(shape.map.mesh, matches.moving) <= shape.within_mm)
         if too_few(matches):
             break
         hidden = held_out(matches.fixed, APART_MM)
-        tested = matches.only(hidden)
-        before, after = _misfit(shape, tested), _misfit(_followed(shape, matches.only(~hidden)), tested)
+        tested, followed = matches.only(hidden), _followed(trial, matches.only(~hidden))
+        before, after = _misfit(trial, tested), _misfit(followed, tested)
         passes.append(Pass(voxel_mm, len(matches), before, after, after < before))
         if after < before:
-            shape = _followed(shape, matches)
-    return BlockRefinement(shape.map.moved, tuple(passes))
+            trial, answer = followed, (trial, matches)
+    if answer is None:
+        return BlockRefinement(shape.map.moved, tuple(passes))
+    return BlockRefinement(_followed(*answer).map.moved, tuple(passes), answer[1])
 
 
 def _around(compared: Compared) -> Compared:
@@ -126,14 +135,18 @@ def _around(compared: Compared) -> Compared:
     return Compared(ct.part(cut_ct), inner_ct, replace(scan, volume=scan.volume.part(cut)), inner)
 
 
-def _starts(compared: Compared, cell_mm: float) -> Array:
-    """Distinctive points (n, 3) RAS mm of the scan's lung, at most one a cell."""
+def _starts(compared: Compared, shape: Shape, cell_mm: float) -> Array:
+    """Distinctive points (n, 3) RAS mm of the scan's lung where blocks are followed, at most one a cell."""
     image = coarsen(compared.scan.volume, PASSES[0][0])
     inside = resample_mask(compared.lung, image.grid).inside
     if not inside.any():
         return np.zeros((0, 3))
     settings = MatchSettings(voxel_mm=PASSES[0][0], cell_mm=cell_mm)
-    return image.grid.to_ras(detect_inside(image, inside, settings).astype(float))
+    points = image.grid.to_ras(detect_inside(image, inside, settings).astype(float))
+    if np.isinf(shape.within_mm):
+        return points
+    at = shape.map.inverse()(points)
+    return np.asarray(points[_depth(shape.map.mesh, at) <= shape.within_mm + PASSES[0][1]])
 
 
 def _blocks(
@@ -152,27 +165,33 @@ def _depth(mesh: TetMesh, points: Array) -> Array:
 
 
 def _followed(shape: Shape, matches: Correspondences) -> Shape:
-    """The lung after it followed matches. Nodes of elements that would turn over are held too; as it was where that
-    does not help.
-    """
+    """The lung after it followed matches."""
     anchors, rest, now = shape.anchors, shape.rest, shape.map.moved
     at = MeshMap(shape.map.mesh, rest.points, shape.map.around)(matches.moving)
-    offset = matches.fixed - shape.map(matches.moving)
-    turned = signed_volumes(now, rest.tets) <= 0
-    for _ in range(ROUNDS):
-        k = len(anchors)
-        wanted = PointConstraints(
-            np.concatenate([at, rest.points[anchors]]),
-            np.concatenate([offset, np.zeros((k, 3))]),
-            np.concatenate([np.full(len(at), SIGMA_MM), np.full(k, ANCHOR_SIGMA_MM)]),
-            np.zeros((len(at) + k, 3)),
-        )
-        field = elastic_correction(rest, now - rest.points, Tissue(), wanted, model_sigma=STRAIN, rounds=1).u
-        turns = (signed_volumes(now + field, rest.tets) <= 0) & ~turned
+    offset, k = matches.fixed - shape.map(matches.moving), len(anchors)
+    wanted = PointConstraints(
+        np.concatenate([at, rest.points[anchors]]),
+        np.concatenate([offset, np.zeros((k, 3))]),
+        np.concatenate([np.full(len(at), SIGMA_MM), np.full(k, ANCHOR_SIGMA_MM)]),
+        np.zeros((len(at) + k, 3)),
+    )
+    field = elastic_correction(rest, now - rest.points, Tissue(), wanted, model_sigma=STRAIN, rounds=1).u
+    return shape.moved(now + unfolded(now, field, rest.tets))
+
+
+def unfolded(points: Array, field: Array, tets: Array) -> Array:
+    """Displacements (n, 3) mm of nodes at points (n, 3), made smaller step by step at the nodes of elements that they
+    would turn over, until no element turns over that did not before.
+    """
+    share = np.ones((len(points), 1))
+    before = signed_volumes(points, tets) > 0
+    for step in range(HALVINGS):
+        turns = before & (signed_volumes(points + share * field, tets) <= 0)
         if not turns.any():
-            return shape.moved(now + field)
-        anchors = np.union1d(anchors, rest.tets[turns])
-    return shape
+            return share * field
+        nodes = np.unique(tets[turns])
+        share[nodes] *= 0.5 if step < HALVINGS // 2 else 0.0
+    return np.zeros_like(field)
 
 
 def _misfit(shape: Shape, matches: Correspondences) -> float:

@@ -85,7 +85,7 @@ class RefinementSettings(_Table):
     """
 
     on: bool = True
-    cell_mm: float = Field(default=5.0, ge=2, le=20)
+    cell_mm: float = Field(default=4.0, ge=2, le=20)
 
 
 class LeaveOutSettings(_Table):
@@ -153,7 +153,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "registration": {"grid_mm": 8.0, "levels": 5, "voxel_mm": 1.5},
         "mesh": {"edge_mm": 6.0},
         "residual": {"grid_mm": 10.0, "voxel_mm": 1.5},
-        "refinement": {"cell_mm": 4.0},
+        "refinement": {"cell_mm": 3.5},
     },
     "auto": {"leave_out": {"first_registration_mm": 10.0, "residual_mm": 0.8}},
 }
