@@ -14,7 +14,19 @@ from numpy.testing import assert_allclose
 from poro.mesh import TetMesh, stuff
 from registration.correspondences import Correspondences
 from registration.maps.rigid import RigidTransform
-from vatsloc.workflow.uncertainty import MODEL_ALONE_MM, correspondence_sigma_mm, covariance, radius95, scatter
+from vatsloc.workflow.uncertainty import (
+    BLOCK_REACH_MM,
+    LEAST_MM,
+    MODEL_ALONE_MM,
+    NEAREST_BLOCKS,
+    PER_BLOCK_MISFIT,
+    PER_BLOCK_MM,
+    block_sigma_mm,
+    correspondence_sigma_mm,
+    covariance,
+    radius95,
+    scatter,
+)
 
 QUANTILE = np.sqrt(7.814728)  # of chi-squared with three degrees of freedom, 95 %
 
@@ -29,10 +41,20 @@ class Scene:
     keypoints: Any = None
     missed: Any = 0.0
     ensemble: Any = field(default_factory=lambda: np.zeros((0, 0, 3)))
+    blocks: Any = None
+    parted: Any = None
+    moved: Any = 0.0
 
     @property
     def pose(self) -> Any:
-        return SimpleNamespace(mesh_inf=self.mesh, points_inf=self.mesh.points, rigid=object())
+        still = RigidTransform.identity()
+        return SimpleNamespace(
+            mesh_inf=self.mesh,
+            points_inf=self.mesh.points,
+            mesh_ct=self.mesh,
+            inf_from_ct_rigid=still,
+            rigid=object(),
+        )
 
     @property
     def collapse(self) -> Any:
@@ -53,6 +75,9 @@ class Scene:
             fit=fit,
             mesh_before=self.mesh,
             mesh_after=self.mesh,
+            points_after=self.mesh.points + self.moved,
+            refinement=None if self.blocks is None else SimpleNamespace(followed=self.blocks),
+            parted=self.parted,
         )
 
     def covariance(self, *points: list[float]) -> Any:
@@ -106,8 +131,45 @@ def test_tissue_is_no_surer_than_the_registration_that_matched_the_keypoints_abo
     assert_allclose(correspondence_sigma_mm(np.zeros(3), np.array([0.0, 0.3, 0.4])), [0.5, 0.5, 0.6])
 
 
-def test_tissue_is_no_surer_than_the_registration_that_found_the_places_about_it() -> None:
-    assert_allclose(correspondence_sigma_mm(np.zeros(3), np.array([0.0, 0.3, 0.4])), [0.5, 0.5, 0.6])
+def test_where_small_blocks_were_followed_their_distance_and_misfit_alone_tell(ball: TetMesh) -> None:
+    n = len(ball.points)
+    at = np.array([[-20.0, 0, 0], [-20.0, 3, 0]])
+    blocks = Correspondences.of(at + [[0, 0, 1.0], [2.0, 0, 0]], at)
+    scene = Scene(ball, np.ones(n, bool), np.full(n, 9.0), keypoints=at, missed=5.0, blocks=blocks)
+    near, far = scene.covariance([-20, 0, 1], [20, 0, 1])
+    assert_allclose(near, (PER_BLOCK_MISFIT * 1.5) ** 2 * np.eye(3), rtol=1e-9)
+    away = PER_BLOCK_MM * (np.linalg.norm([38.0, 3, 1]) - BLOCK_REACH_MM)
+    assert_allclose(far, (PER_BLOCK_MISFIT * 1.5 + away) ** 2 * np.eye(3), rtol=1e-9)
+
+
+def test_the_nearest_blocks_alone_tell(ball: TetMesh) -> None:
+    at = np.concatenate([np.tile([-20.0, 0, 0], (NEAREST_BLOCKS, 1)), np.tile([20.0, 0, 0], (NEAREST_BLOCKS, 1))])
+    missed = np.repeat([[0.0, 1, 0], [0.0, 0, 3]], NEAREST_BLOCKS, axis=0)
+    scene = Scene(ball, blocks=Correspondences.of(at + missed, at))
+    left, right = scene.covariance([-20, 1, 0], [20, 0, 3])
+    assert_allclose(left[0, 0], (PER_BLOCK_MISFIT * 1) ** 2, rtol=1e-9)
+    assert_allclose(right[0, 0], (PER_BLOCK_MISFIT * 3) ** 2, rtol=1e-9)
+    assert_allclose(block_sigma_mm(np.zeros(1), np.zeros(1)), [LEAST_MM])
+
+
+def test_beside_a_cut_the_ellipsoid_holds_where_the_other_piece_went(ball: TetMesh) -> None:
+    upper = ball.points[:, 2] > 0
+    gap = np.array([3.0, 0, 20.0])
+    cut = SimpleNamespace(
+        fissure=SimpleNamespace(sheet=SimpleNamespace(distance=lambda x: x[:, 2])),
+        pieces=SimpleNamespace(node_piece=lambda: upper.astype(int)),
+    )
+    moved = upper[:, None] * gap
+    blocks = Correspondences.of(ball.points + moved, ball.points)
+    scene = Scene(ball, blocks=blocks, parted=cut, moved=moved)
+    points = np.array([[0, 0, 2.0], [0, 0, -2.0], [0, 0, 20.0]])
+    found = covariance(scene.pose, scene.collapse, points, points + [[1.0], [0], [1]] * gap)
+    for beside in found[:2]:
+        assert gap @ np.linalg.solve(beside, gap) < QUANTILE**2
+        left = beside - np.outer(gap, gap) / QUANTILE**2
+        assert_allclose(left, left[0, 0] * np.eye(3), atol=1e-9)
+    assert gap @ np.linalg.solve(found[2], gap) > QUANTILE**2
+    assert gap @ np.linalg.solve(Scene(ball, blocks=blocks, moved=moved).covariance([0, 0, 2.0])[0], gap) > QUANTILE**2
 
 
 def test_scatter_is_the_second_moment_of_the_other_answers(ball: TetMesh) -> None:

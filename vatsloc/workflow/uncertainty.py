@@ -8,13 +8,18 @@ from scipy.spatial import cKDTree
 from poro.fit import ellipsoid95, point_covariance
 from poro.fit.covariance import CHI2_95_3D
 from poro.mesh import interpolate, locate
+from registration.correspondences import Correspondences
+from registration.maps.rigid import RigidTransform
 from registration.verification import LeftOver
 from registration.volume import Array
+from vatsloc.maps import MeshMap
 from vatsloc.workflow.pneumothorax import Collapse
 from vatsloc.workflow.pose import ChangeOfPose
 
 REGISTRATION_MM = 0.5
 """Standard deviation per axis of one registration where it holds: a quarter of its finest voxel."""
+LEAST_MM = 0.25
+"""The same where small blocks were followed."""
 MODEL_ALONE_MM = 4.0
 """The same of the model without images inside the lung: 1.7 to 6.9 mm on twins and phantoms."""
 NEAREST, PER_MISFIT, REACH_MM, PER_MM = 6, 1.5, 8.0, 0.15
@@ -23,7 +28,10 @@ average, and PER_MM for every millimetre beyond REACH_MM from the nearest one. Q
 chain's errors at 16,000 tissue points of the three twins and of five phantoms outside the suite (adhesion 205,
 near-total-collapse 206, part-solid 207, base 208, poor-dose 209)."""
 
-
+NEAREST_BLOCKS, PER_BLOCK_MISFIT, BLOCK_REACH_MM, PER_BLOCK_MM = 12, 0.9, 4.0, 0.23
+"""The same where the lung followed small blocks, from the twelve nearest of those."""
+SHEET_MM = 5.0
+"""How far from a cut tissue may belong to the other piece: a bowed sheet is not where the fissure is everywhere."""
 WITHOUT_INFLATED = 1.1
 """Factor on the standard deviation where no inflated scan was taken: what holds 95 % of the tissue within 10 mm of the
 pleura of a phantom outside the suite (right 300; 93 % without it)."""
@@ -39,8 +47,9 @@ def covariance(
 
     Where the images placed the tissue around a point, it holds the registrations' errors and their disagreement; where
     they did not, the fit's covariance and the scatter of the ensemble. Either way its standard deviation is at least
-    that of the nearest keypoints: from their distance, and from how well the result follows them. left: the error of
-    the chain that the run's check of itself found; where it lies outside the ellipsoid, the covariance is widened.
+    that of the nearest keypoints: from their distance, and from how well the result follows them. Where the lung
+    followed small blocks, these alone say it; beside a cut, so does where the other piece went. left: the error of the
+    chain that the run's check of itself found; where it lies outside the ellipsoid, the covariance is widened.
     """
     own = _covariance(pose, collapse, inflated, deflated)
     if pose.rigid is None:
@@ -60,6 +69,36 @@ def widened(covariance: Array, vectors: Array) -> Array:
 
 
 def _covariance(pose: ChangeOfPose, collapse: Collapse, inflated: Array, deflated: Array) -> Array:
+    blocks = None if collapse.refinement is None else collapse.refinement.followed
+    if blocks is None:
+        return _of_fit(pose, collapse, inflated, deflated)
+    around = collapse.def_from_inf_rigid @ pose.inf_from_ct_rigid
+    known = nearest(MeshMap(pose.mesh_ct, collapse.points_after, around), blocks, deflated, NEAREST_BLOCKS)
+    sigma_mm = block_sigma_mm(*known)
+    return np.asarray(sigma_mm[:, None, None] ** 2 * np.eye(3) + _beside_cut(pose, collapse, inflated))
+
+
+def _beside_cut(pose: ChangeOfPose, collapse: Collapse, inflated: Array) -> Array:
+    """What is added (n, 3, 3) mm2 beside a cut, so that the ellipsoid holds where the other piece went."""
+    added: Array = np.zeros((len(inflated), 3, 3))
+    if collapse.parted is None:
+        return added
+    pieces, sheet = collapse.parted.pieces, collapse.parted.fissure.sheet
+    of_node = pieces.node_piece()
+    around = collapse.def_from_inf_rigid @ pose.inf_from_ct_rigid
+    motion = collapse.points_after - around(pose.mesh_ct.points)
+    points = interpolate(locate(pose.mesh_inf, inflated), pose.mesh_ct.points)
+    beside = np.flatnonzero(np.abs(sheet.distance(points)) < SHEET_MM)
+    moved = []
+    for number in (0, 1):
+        mine = np.flatnonzero(of_node == number)
+        moved.append(motion[mine[cKDTree(pose.mesh_ct.points[mine]).query(points[beside])[1]]])
+    apart = moved[1] - moved[0]
+    added[beside] = apart[:, :, None] * apart[:, None, :] / CHI2_95_3D
+    return added
+
+
+def _of_fit(pose: ChangeOfPose, collapse: Collapse, inflated: Array, deflated: Array) -> Array:
     points = collapse.def_from_inf_rigid(inflated)
     residual = collapse.residual
     least_mm, model_mm = np.zeros(len(points)), np.full(len(points), MODEL_ALONE_MM)
@@ -94,11 +133,25 @@ def nearest_correspondences(collapse: Collapse, deflated: Array) -> tuple[Array,
     """Distance (n,) mm from points (n, 3) of the deflated CBCT to the nearest keypoint, and by how many mm (n,) the
     result misses the nearest few of them on average.
     """
-    found, before = collapse.model.correspondences, collapse.mesh_before
-    moved = interpolate(locate(before, found.moving), collapse.mesh_after.points - before.points)
-    missed = np.linalg.norm(found.moving + moved - found.fixed, axis=1)
-    distance, number = cKDTree(found.fixed).query(deflated, min(NEAREST, len(found)))
+    before, after = collapse.mesh_before, collapse.mesh_after.points
+    return nearest(MeshMap(before, after, RigidTransform.identity()), collapse.model.correspondences, deflated, NEAREST)
+
+
+def nearest(moved: MeshMap, found: Correspondences, points: Array, count: int) -> tuple[Array, Array]:
+    """Distance (n,) mm from points (n, 3) to the nearest place `fixed` of correspondences, and by how many mm (n,) a
+    map of `moving` misses the nearest `count` of them on average.
+    """
+    missed = np.linalg.norm(moved(found.moving) - found.fixed, axis=1)
+    distance, number = cKDTree(found.fixed).query(points, range(1, min(count, len(found)) + 1))
     return distance[:, 0], missed[number].mean(axis=1)
+
+
+def block_sigma_mm(distance_mm: Array, misfit_mm: Array) -> Array:
+    """Standard deviation (n,) mm per axis of tissue at a distance (n,) from the nearest block that the lung followed,
+    where it misses the nearest blocks by a misfit (n,).
+    """
+    told = PER_BLOCK_MISFIT * misfit_mm + PER_BLOCK_MM * np.maximum(distance_mm - BLOCK_REACH_MM, 0.0)
+    return np.maximum(told, LEAST_MM)
 
 
 def correspondence_sigma_mm(distance_mm: Array, misfit_mm: Array) -> Array:
