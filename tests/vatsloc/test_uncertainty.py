@@ -21,6 +21,7 @@ from vatsloc.workflow.uncertainty import (
     NEAREST_BLOCKS,
     PER_BLOCK_MISFIT,
     PER_BLOCK_MM,
+    SHEET_FACTOR,
     block_sigma_mm,
     correspondence_sigma_mm,
     covariance,
@@ -133,12 +134,12 @@ def test_tissue_is_no_surer_than_the_registration_that_matched_the_keypoints_abo
 
 def test_where_small_blocks_were_followed_their_distance_and_misfit_alone_tell(ball: TetMesh) -> None:
     n = len(ball.points)
-    at = np.array([[-20.0, 0, 0], [-20.0, 3, 0]])
-    blocks = Correspondences.of(at + [[0, 0, 1.0], [2.0, 0, 0]], at)
+    at = np.array([[-20.0, -4, 0], [-20.0, 4, 0]])
+    blocks = Correspondences.of(at + np.array([[0, 0, 1.0], [0, 0, 2.0]]), at)
     scene = Scene(ball, np.ones(n, bool), np.full(n, 9.0), keypoints=at, missed=5.0, blocks=blocks)
-    near, far = scene.covariance([-20, 0, 1], [20, 0, 1])
+    near, far = scene.covariance([-20, 2, 1.5], [20, 0, 1.5])
     assert_allclose(near, (PER_BLOCK_MISFIT * 1.5) ** 2 * np.eye(3), rtol=1e-9)
-    away = PER_BLOCK_MM * (np.linalg.norm([38.0, 3, 1]) - BLOCK_REACH_MM)
+    away = PER_BLOCK_MM * (40 - BLOCK_REACH_MM)
     assert_allclose(far, (PER_BLOCK_MISFIT * 1.5 + away) ** 2 * np.eye(3), rtol=1e-9)
 
 
@@ -166,7 +167,7 @@ def test_beside_a_cut_the_ellipsoid_holds_where_the_other_piece_went(ball: TetMe
     found = covariance(scene.pose, scene.collapse, points, points + [[1.0], [0], [1]] * gap)
     for beside in found[:2]:
         assert gap @ np.linalg.solve(beside, gap) < QUANTILE**2
-        left = beside - np.outer(gap, gap) / QUANTILE**2
+        left = beside - np.outer(SHEET_FACTOR * gap, SHEET_FACTOR * gap) / QUANTILE**2
         assert_allclose(left, left[0, 0] * np.eye(3), atol=1e-9)
     assert gap @ np.linalg.solve(found[2], gap) > QUANTILE**2
     assert gap @ np.linalg.solve(Scene(ball, blocks=blocks, moved=moved).covariance([0, 0, 2.0])[0], gap) > QUANTILE**2
