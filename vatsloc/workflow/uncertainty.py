@@ -31,8 +31,8 @@ near-total-collapse 206, part-solid 207, base 208, poor-dose 209)."""
 NEAREST_BLOCKS, PER_BLOCK_MISFIT, BLOCK_REACH_MM, PER_BLOCK_MM = 12, 1.0, 3.0, 0.33
 """The same where the lung followed small blocks: PER_BLOCK_MISFIT for every millimetre by which it misses the twelve
 nearest ones on average, PER_BLOCK_MM for every millimetre beyond BLOCK_REACH_MM from their middle, which is far where
-all lie to one side. Quantile regression (95 %) at tissue points of phantoms outside the suite (base 505, near-total-collapse
-506, left 504, a twin of a real chest 501)."""
+all lie to one side. Quantile regression (95 %) at tissue points of phantoms outside the suite (base 505,
+near-total-collapse 506, left 504, a twin of a real chest 501)."""
 SHEET_MM, SHEET_FACTOR = 8.0, 1.4
 """How far from a cut tissue may belong to the other piece, since a bowed sheet is not where the fissure is everywhere,
 and by how much the ellipsoid reaches beyond where that went: it holds 96 % of the tissue beside the cuts of base 505
