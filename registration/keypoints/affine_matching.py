@@ -6,11 +6,12 @@ other has not, a correlation over whole blocks cannot tell.
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, prange
+from numba import get_num_threads, njit
 
 from registration.kernels.correlation import coefficient
 from registration.kernels.trilinear import value
@@ -22,6 +23,8 @@ WIDTH = 2 * RADIUS + 1
 """Of a block, voxels; known when kernels are compiled, or they are five times slower."""
 LEAST_INSIDE = 0.35
 """Share of a block's voxels that have to lie inside in both images."""
+BATCH = 256
+"""Blocks that a thread matches at a time."""
 LEAST_NCC = 0.3
 """Below this there is no need to look for the way back."""
 
@@ -63,14 +66,14 @@ def match_affine_blocks(
     """
     n = len(starts)
     best = _Best(np.zeros((n, 3), np.int64), np.full((n, 27), -1, np.float32), np.zeros((n, 3), np.int64))
-    _match_all(
-        _centred(fixed),
-        _centred(moving),
-        np.ascontiguousarray(starts, np.int64),
-        np.ascontiguousarray(affines, float),
-        reach,
-        best,
-    )
+    images = _centred(fixed), _centred(moving)
+    where = np.ascontiguousarray(starts, np.int64), np.ascontiguousarray(affines, float)
+
+    def work(first: int) -> None:
+        _match_some(*images, where, reach, best, first, min(first + BATCH, n))
+
+    with ThreadPoolExecutor(get_num_threads()) as threads:  # a quarter of the compiling that `prange` takes
+        list(threads.map(work, range(0, n, BATCH)))
     offset, is_peak = subvoxel_peak(best.around)
     ncc = np.where(is_peak, best.around[:, 13], -1)
     return BlockMatches(best.shift + offset, ncc, np.linalg.norm(best.back, axis=1))
@@ -146,55 +149,58 @@ def _add_up(image, side, sums):
 
 
 @njit(cache=True)
-def _scores(block, image, first, reach):
-    """NCC (2 reach + 1, ...) of a block at every shift about the voxel `first` (3,) of an image, over voxels that count
-    in both, -1 where those are few or show nothing, and the shift (3,) of the best.
-    """
-    n = 2 * reach + 1
-    side = n + WIDTH - 1
-    near = _block(image, first - reach, side)
-    one, counts = block.inside.astype(np.float32), near.inside.astype(np.float32)
-    f, flat_n, flat_m = block.hu * one, counts.ravel(), (near.hu * counts).ravel()
-    sums = np.zeros((6, n, (n - 1) * side + n), np.float32)
-    if block.inside.all():
-        _add_up(flat_n, side, sums[0])
-        _add_up(flat_m, side, sums[2])
-        _add_up(flat_m * flat_m, side, sums[4])
-    else:
-        _correlate(one, flat_n, side, sums[0])
-        _correlate(one, flat_m, side, sums[2])
-        _correlate(one, flat_m * flat_m, side, sums[4])
-    if near.inside.all():
-        sums[1], sums[3] = f.sum(), (f * f).sum()
-    else:
-        _correlate(f, flat_n, side, sums[1])
-        _correlate(f * f, flat_n, side, sums[3])
-    _correlate(f, flat_m, side, sums[5])
-    return _coefficients(sums, near.inside, reach)
+def _powers(image):
+    """Which voxels count, their values and the squares of these, (3, n) float32, voxel by voxel."""
+    hu, inside = image.hu.ravel(), image.inside.ravel()
+    powers = np.zeros((3, hu.size), np.float32)
+    for n in range(hu.size):
+        if inside[n]:
+            powers[0, n], powers[1, n], powers[2, n] = 1, hu[n], hu[n] * hu[n]
+    return powers
 
 
 @njit(cache=True)
-def _coefficients(sums, inside, reach):
+def _scores(block, near, reach, best):
+    """NCC (2 reach + 1, ...) of a block at every shift within an image `near`, over voxels that count in both, -1 where
+    those are few or show nothing. best: (3,) set to the best shift.
+    """
+    n, side = 2 * reach + 1, near.hu.shape[0]
+    taps, images = _powers(block), _powers(near)
+    sums = np.zeros((6, n, (n - 1) * side + n), np.float32)
+    whole = block.inside.all()
+    for k in range(6):  # sums of 1, f, m, f^2, m^2 and f m
+        one, other = (0, 1, 0, 2, 0, 1)[k], (0, 0, 1, 0, 2, 1)[k]
+        if whole and one == 0:
+            _add_up(images[other], side, sums[k])
+        else:
+            _correlate(taps[one].reshape((WIDTH, WIDTH, WIDTH)), images[other], side, sums[k])
+    return _coefficients(sums, near.inside, reach, best)
+
+
+@njit(cache=True)
+def _coefficients(sums, inside, reach, best):
     """What `_scores` returns, from the sums (6, n, m) of `coefficient`. inside: what of the image searched counts."""
-    n, flat = 2 * reach + 1, np.float32(FLAT_HU**2)
-    scores, top, best = np.full((n, n, n), np.float32(-1)), np.float32(-1), np.zeros(3, np.int64)
+    n, flat, top = 2 * reach + 1, np.float32(FLAT_HU**2), np.float32(-1)
+    scores = np.full((n, n, n), np.float32(-1))
     for p in range(n):
         for q in range(n):
             for r in range(n):
-                known, f, m, ff, mm, fm = sums[:, p, q * inside.shape[0] + r]
+                t = q * inside.shape[0] + r
+                known = sums[0, p, t]
                 if not inside[p + RADIUS, q + RADIUS, r + RADIUS] or known < LEAST_INSIDE * WIDTH**3:
                     continue
-                scores[p, q, r] = coefficient(known, f, m, ff, mm, fm, flat, flat)
+                scores[p, q, r] = coefficient(
+                    known, sums[1, p, t], sums[2, p, t], sums[3, p, t], sums[4, p, t], sums[5, p, t], flat, flat
+                )
                 if scores[p, q, r] > top:
                     top = scores[p, q, r]
                     best[0], best[1], best[2] = p - reach, q - reach, r - reach
-    return scores, best
+    return scores
 
 
 @njit(cache=True)
-def _block(image, first, width):
-    """The block whose first voxel is `first` (3,)."""
-    a, b, c = first
+def _block(image, a, b, c, width):
+    """The block whose first voxel is (a, b, c)."""
     return MaskedImage(
         image.hu[a : a + width, b : b + width, c : c + width].copy(),
         image.inside[a : a + width, b : b + width, c : c + width].copy(),
@@ -202,27 +208,38 @@ def _block(image, first, width):
 
 
 @njit(cache=True)
-def _match(fixed, moving, start, affine, reach, shift, around, back):
-    """One block of `match_affine_blocks`."""
-    half = RADIUS + reach
+def _holds(image, at, half):
     for m in range(3):
-        if start[m] < half or start[m] >= fixed.hu.shape[m] - half:
-            return
-    block = _block(fixed, start - RADIUS, WIDTH)
-    if block.inside.sum() < LEAST_INSIDE * WIDTH**3:
-        return
-    cube = _warped(moving, affine, half)
-    middle = np.full(3, reach)
-    scores, best = _scores(block, cube, middle, reach)
-    a, b, c = best + reach
-    if np.abs(best).max() == reach or scores[a, b, c] < LEAST_NCC:
-        return
-    shift[:] = best
-    around[:] = scores[a - 1 : a + 2, b - 1 : b + 2, c - 1 : c + 2].copy().ravel()
-    back[:] = _scores(_block(cube, middle + best, WIDTH), fixed, start - RADIUS, reach)[1]
+        if at[m] < half or at[m] >= image.hu.shape[m] - half:
+            return False
+    return True
 
 
-@njit(cache=True, parallel=True)
-def _match_all(fixed, moving, starts, affines, reach, best):
-    for n in prange(starts.shape[0]):
-        _match(fixed, moving, starts[n], affines[n], reach, best.shift[n], best.around[n], best.back[n])
+@njit(cache=True, nogil=True)
+def _match_some(fixed, moving, where, reach, best, first, end):
+    """Blocks first..end of `match_affine_blocks`. where: starts and affines."""
+    half = RADIUS + reach
+    for n in range(first, end):
+        start, found = where[0][n], np.zeros(3, np.int64)
+        if not _holds(fixed, start, half):
+            continue
+        block = _block(fixed, start[0] - RADIUS, start[1] - RADIUS, start[2] - RADIUS, WIDTH)
+        if block.inside.sum() < LEAST_INSIDE * WIDTH**3:
+            continue
+        cube = _warped(moving, where[1][n], half)
+        near = cube
+        for way in range(2):  # there, and from what was found back
+            scores = _scores(block, near, reach, found)
+            a, b, c = found[0] + reach, found[1] + reach, found[2] + reach
+            if way == 1:
+                for m in range(3):
+                    best.back[n, m] = found[m]
+            elif max(abs(found[0]), abs(found[1]), abs(found[2])) == reach or scores[a, b, c] < LEAST_NCC:
+                break
+            else:
+                for m in range(27):
+                    best.around[n, m] = scores[a - 1 + m // 9, b - 1 + m // 3 % 3, c - 1 + m % 3]
+                for m in range(3):
+                    best.shift[n, m], found[m] = found[m], 0
+                block = _block(cube, a, b, c, WIDTH)
+                near = _block(fixed, start[0] - half, start[1] - half, start[2] - half, 2 * half + 1)
