@@ -209,10 +209,11 @@ def _block(image, a, b, c, width):
 
 @njit(cache=True)
 def _holds(image, at, half):
+    """Whether a cube about a voxel (3,) lies in an image."""
+    inside = True
     for m in range(3):
-        if at[m] < half or at[m] >= image.hu.shape[m] - half:
-            return False
-    return True
+        inside &= half <= at[m] < image.hu.shape[m] - half
+    return inside
 
 
 @njit(cache=True, nogil=True)
