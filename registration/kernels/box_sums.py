@@ -16,6 +16,12 @@ def box_sums(values: Array, radius: int) -> Array:
     return out
 
 
+@njit(cache=True)
+def _add(sums, row, sign):
+    for k in range(len(sums)):
+        sums[k] += sign * row[k]
+
+
 @njit(cache=True, parallel=True)
 def _sum_in_planes(values, radius, out):
     nq, ni, nj, nk = values.shape
@@ -31,29 +37,27 @@ def _sum_in_planes(values, radius, out):
                 if k - radius - 1 >= 0:
                     run -= plane[j, k - radius - 1]
                 rows[j, k] = run
-        run_j = np.zeros(nk)
-        for j in range(min(radius, nj)):
-            run_j += rows[j]
-        for j in range(nj):
-            if j + radius < nj:
-                run_j += rows[j + radius]
-            if j - radius - 1 >= 0:
-                run_j -= rows[j - radius - 1]
-            out[t // ni, t % ni, j] = run_j
+        _run_down(rows, radius, out[t // ni, t % ni])
 
 
 @njit(cache=True, parallel=True)
 def _sum_across_planes(values, radius):
-    nq, ni, nj, nk = values.shape
+    nq, _, nj, _ = values.shape
     for t in prange(nq * nj):
-        q, j = t // nj, t % nj
-        column = values[q, :, j].copy()
-        run = np.zeros(nk)
-        for i in range(min(radius, ni)):
-            run += column[i]
-        for i in range(ni):
-            if i + radius < ni:
-                run += column[i + radius]
-            if i - radius - 1 >= 0:
-                run -= column[i - radius - 1]
-            values[q, i, j] = run
+        column = values[t // nj, :, t % nj]
+        _run_down(column.copy(), radius, column)
+
+
+@njit(cache=True)
+def _run_down(rows, radius, out):
+    """Sums of the 2 radius + 1 rows about every row."""
+    n, run = len(rows), np.zeros(rows.shape[1])
+    for j in range(min(radius, n)):
+        _add(run, rows[j], 1)
+    for j in range(n):
+        if j + radius < n:
+            _add(run, rows[j + radius], 1)
+        if j - radius - 1 >= 0:
+            _add(run, rows[j - radius - 1], -1)
+        for k in range(len(run)):
+            out[j, k] = run[k]

@@ -106,7 +106,8 @@ def _popcount(bits):
 def _differences(hu, i, j, start, stop, one, other, out):
     """Sums of squared differences of the 27 voxels about two neighbours, of voxels (i, j, start) to (i, j, stop)."""
     n = stop - start
-    out[:n] = 0
+    for k in range(n):
+        out[k] = 0
     for a in range(-1, 2):
         for b in range(-1, 2):
             here, there = hu[i + a + one[0], j + b + one[1]], hu[i + a + other[0], j + b + other[1]]
@@ -129,9 +130,13 @@ def _describe(padded, needed, first, second, out):
             for m in range(len(first)):
                 _differences(padded, i + RIM, j + RIM, start + RIM, stop + RIM, first[m], second[m], apart[m])
             for k in asked:
-                own[:] = apart[:, k - start]
-                own -= own.min()
-                spread = max(own.mean(), np.float32(1e-3))
+                least, total = apart[0, k - start], np.float32(0)
+                for m in range(len(first)):
+                    least = min(least, apart[m, k - start])
+                for m in range(len(first)):
+                    own[m] = apart[m, k - start] - least
+                    total += own[m]
+                spread = max(total / np.float32(len(first)), np.float32(1e-3))
                 bits = np.uint64(0)
                 for m in range(len(first)):
                     closeness, level = -own[m] / spread, 0
@@ -192,7 +197,12 @@ def _fill(cost, pair, start, own, window):
         for b in range(max(middle[1] - half, 0), min(middle[1] + half + 1, cost.shape[1]), step):
             for c in range(max(middle[2] - half, 0), min(middle[2] + half + 1, cost.shape[2]), step):
                 at[0], at[1], at[2] = start[0] + a - reach, start[1] + b - reach, start[2] + c - reach
-                if at.min() < 0 or at[0] >= pair.shape[0] or at[1] >= pair.shape[1] or at[2] >= pair.shape[2]:
+                if (
+                    min(at[0], at[1], at[2]) < 0
+                    or at[0] >= pair.shape[0]
+                    or at[1] >= pair.shape[1]
+                    or at[2] >= pair.shape[2]
+                ):
                     continue
                 if cost[a, b, c] != NO_COST or not pair.allowed[at[0], at[1], at[2]]:
                     continue
@@ -205,7 +215,7 @@ def _fill(cost, pair, start, own, window):
 @njit(cache=True)
 def _top(cost):
     top, width = np.argmin(cost), cost.shape[0]
-    return np.array([top // width**2, top // width % width, top % width])
+    return top // width**2, top // width % width, top % width
 
 
 @njit(cache=True, parallel=True)
@@ -220,17 +230,24 @@ def _search(pair, starts, reach, best, shift, around):
         for m in range(len(own)):
             own[m] = pair.fixed[_number(pair.shape, starts[n]) + pair.offsets[m]]
         cost = np.full((width, width, width), NO_COST)
-        _fill(cost, pair, starts[n], own, (np.full(3, reach), reach, 2))
+        _fill(cost, pair, starts[n], own, ((reach, reach, reach), reach, 2))
         _fill(cost, pair, starts[n], own, (_top(cost), 3, 1))
-        top = _top(cost)
-        i, j, k = top
+        i, j, k = _top(cost)
         best[n, 0] = cost[i, j, k]
-        shift[n] = top - reach
-        if top.min() > 0 and top.max() < width - 1:
-            around[n] = cost[i - 1 : i + 2, j - 1 : j + 2, k - 1 : k + 2].copy().ravel()
-        cost[
-            max(i - EXCLUDED, 0) : i + EXCLUDED + 1,
-            max(j - EXCLUDED, 0) : j + EXCLUDED + 1,
-            max(k - EXCLUDED, 0) : k + EXCLUDED + 1,
-        ] = NO_COST
-        best[n, 1] = cost.min()
+        shift[n, 0], shift[n, 1], shift[n, 2] = i - reach, j - reach, k - reach
+        if min(i, j, k) > 0 and max(i, j, k) < width - 1:
+            for m in range(27):
+                around[n, m] = cost[i - 1 + m // 9, j - 1 + m // 3 % 3, k - 1 + m % 3]
+        best[n, 1] = _least_elsewhere(cost, (i, j, k))
+
+
+@njit(cache=True)
+def _least_elsewhere(cost, top):
+    """Least cost of shifts farther than EXCLUDED voxels from the best along some axis."""
+    least = NO_COST
+    for a in range(cost.shape[0]):
+        for b in range(cost.shape[1]):
+            for c in range(cost.shape[2]):
+                if max(abs(a - top[0]), abs(b - top[1]), abs(c - top[2])) > EXCLUDED:
+                    least = min(least, cost[a, b, c])
+    return least
