@@ -32,8 +32,11 @@ MARGIN_MM = 16.0
 """What is kept of a scan about the lung: more than a block and its search reach."""
 RIM_MM = 2.0
 """What is cut off the lung in both images: nearer than this to its border, voxels also show what lies beyond."""
-SIGMA_MM, STRAIN = 1.0, 0.01
-"""Standard deviation of a block's position, and how far tissue gives way to it (`elastic_correction`)."""
+SIGMA_MM, STRAIN = (1.0, 2.0), 0.01
+"""Standard deviation of a block's position, near the pleura and deep below it, and how far tissue gives way to it
+(`elastic_correction`). Deep in the lung what came before is as sure as a block."""
+SHALLOW_MM, DEEP_MM = 8.0, 20.0
+"""Where the one ends and the other begins."""
 ANCHOR_SIGMA_MM = 0.2
 """Standard deviation of nodes that other evidence has placed."""
 HALVINGS = 20
@@ -169,10 +172,11 @@ def _followed(shape: Shape, matches: Correspondences) -> Shape:
     anchors, rest, now = shape.anchors, shape.rest, shape.map.moved
     at = MeshMap(shape.map.mesh, rest.points, shape.map.around)(matches.moving)
     offset, k = matches.fixed - shape.map(matches.moving), len(anchors)
+    sigma_mm = np.interp(_depth(shape.map.mesh, matches.moving), (SHALLOW_MM, DEEP_MM), SIGMA_MM)
     wanted = PointConstraints(
         np.concatenate([at, rest.points[anchors]]),
         np.concatenate([offset, np.zeros((k, 3))]),
-        np.concatenate([np.full(len(at), SIGMA_MM), np.full(k, ANCHOR_SIGMA_MM)]),
+        np.concatenate([sigma_mm, np.full(k, ANCHOR_SIGMA_MM)]),
         np.zeros((len(at) + k, 3)),
     )
     field = elastic_correction(rest, now - rest.points, Tissue(), wanted, model_sigma=STRAIN, rounds=1).u
