@@ -91,7 +91,8 @@ def _within(inside: Array, distance_mm: float, spacing: Array) -> Array:
 @njit(cache=True, parallel=True)
 def _along_first(squared, reach, step, out):
     n, nj, nk = squared.shape
-    for i in prange(n):
+    for plane in prange(n):
+        i = np.int64(plane)  # unsigned until here
         _lower(out, squared, (i, 0, 0), (i, 0, 0), (nj, nk), np.float32(0))
         for o in range(-reach, reach + 1):
             if o != 0 and 0 <= i + o < n:
@@ -101,7 +102,8 @@ def _along_first(squared, reach, step, out):
 @njit(cache=True, parallel=True)
 def _along_others(squared, axis, reach, step, out):
     ni, nj, nk = squared.shape
-    for i in prange(ni):
+    for plane in prange(ni):
+        i = np.int64(plane)
         _lower(out, squared, (i, 0, 0), (i, 0, 0), (nj, nk), np.float32(0))
         for o in range(1, reach + 1):
             rise = np.float32((o * step) ** 2)
