@@ -14,7 +14,7 @@ from scipy.sparse import coo_matrix
 from poro.arrays import Array
 from poro.fem.constraints import point_constraints
 from poro.fem.forms import deformation_gradient
-from poro.fem.solid import solid
+from poro.fem.solid import constrained, solid
 from poro.fem.tissue import Tissue
 from poro.mesh.tetmesh import TetMesh
 
@@ -88,4 +88,4 @@ def _continue(mesh: TetMesh, nodes: Array, displacement: Array, tissue: Tissue, 
     k = len(nodes)
     operator = coo_matrix((np.ones(k), (np.arange(k), nodes)), shape=(k, len(mesh.points))).tocsr()
     matrix, force = point_constraints(operator, stiffness, displacement)
-    return solid(mesh, tissue, np.zeros(0, int), matrix).solve(force)
+    return constrained(mesh, tissue, matrix, force)

@@ -10,7 +10,7 @@ from scipy.sparse import csr_matrix
 from poro.arrays import Array
 from poro.fem.forms import stiffness
 from poro.fem.tissue import Tissue
-from poro.linalg.solver import LinearSolver, linear_solver
+from poro.linalg.solver import LinearSolver, linear_solver, solve_once
 from poro.mesh.tetmesh import TetMesh
 
 
@@ -65,3 +65,11 @@ def solid(mesh: TetMesh, tissue: Tissue, fixed: Array, constraints: csr_matrix |
     reduced = matrix[rows]
     solver = linear_solver(reduced[:, rows].tocsr(), mesh.points[free])
     return Solid(mesh, fixed, rows, solver, reduced[:, unknowns_of(fixed)].tocsr())
+
+
+def constrained(mesh: TetMesh, tissue: Tissue, constraints: csr_matrix, force: Array) -> Array:
+    """Displacements (n, 3) mm under nodal forces (n, 3) kPa mm2 of a body that point constraints (3n, 3n) kPa mm alone
+    hold. Raises SolverError when they do not suffice.
+    """
+    matrix = (stiffness(mesh, tissue.lame_kpa, tissue.shear_kpa) + constraints).tocsr()
+    return solve_once(matrix, mesh.points, force.ravel()).reshape(-1, 3)

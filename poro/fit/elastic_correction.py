@@ -14,7 +14,7 @@ from scipy.sparse import diags
 from poro.arrays import Array
 from poro.fem.constraints import interpolation_matrix, point_constraints
 from poro.fem.forms import deformation_gradient
-from poro.fem.solid import solid
+from poro.fem.solid import constrained
 from poro.fem.tissue import Tissue
 from poro.fit.observations import Target, facing, independence
 from poro.fit.problem import FitSettings
@@ -108,7 +108,7 @@ def elastic_correction(
         unit = tissue.young_kpa * REGION_MM3 * (model_sigma / 2.0 ** (rounds - 1 - number)) ** 2
         penalty = (unit * influence / wanted.sigma_mm**2)[:, None, None] * shape
         matrix, force = point_constraints(operator, penalty, wanted.offset)
-        field = solid(mesh, tissue, np.zeros(0, int), (matrix + anchor).tocsr()).solve(force)
+        field = constrained(mesh, tissue, (matrix + anchor).tocsr(), force)
         misfit = np.linalg.norm(np.einsum("qij,qj->qi", shape, wanted.offset - operator @ field), axis=1)
         scale = robust * np.maximum(wanted.sigma_mm, 1.4826 * np.median(misfit[influence > 0]))
         influence = _near(where) / (1 + (misfit / scale) ** 2)

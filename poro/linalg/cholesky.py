@@ -36,7 +36,7 @@ class Cholesky:
         if len(right) != self.size:
             raise ValueError(f"right-hand side must have {self.size} rows, got {len(right)}")
         order, spans, rows = self._order, self._spans, self._borders
-        y = np.asarray(right, float)[order]
+        y = np.asarray(right, self.diagonal_inverse[0].dtype)[order]
         for span, border, inverse, below in zip(spans, rows, self.diagonal_inverse, self.below, strict=True):
             y[span] = inverse @ y[span]
             if len(border):
@@ -101,29 +101,32 @@ class Cholesky:
         return [_unknowns(f.border, self.block) for f in self.tree.fronts]
 
 
-def cholesky(matrix: csr_matrix, tree: Tree, block: int) -> Cholesky:
-    """Factor a symmetric positive definite matrix (n * block, n * block) along an elimination tree.
+def cholesky(matrix: csr_matrix, tree: Tree, block: int, dtype: type = np.float64) -> Cholesky:
+    """Factor a symmetric positive definite matrix (n * block, n * block) along an elimination tree, in double or single
+    precision.
 
     Raises SolverError when a pivot is not positive, that is when the body can still move freely.
     """
     order = _unknowns(tree.order, block)
-    permuted = csr_matrix(matrix)[order][:, order]
+    permuted = csr_matrix(matrix, dtype=dtype)[order][:, order]
+    potrf, trtri = lapack.get_lapack_funcs(("potrf", "trtri"), dtype=dtype)
+    syrk = blas.get_blas_funcs("syrk", dtype=dtype)
     pending: list[Array | None] = []
     inverses, belows = [], []
     for front in tree.fronts:
         dense = _assemble(permuted, tree, front, block, pending)
         n = (front.last - front.first) * block
-        lower, info = lapack.dpotrf(dense[:n, :n], lower=1)
+        lower, info = potrf(dense[:n, :n], lower=1)
         if info:
             raise SolverError("matrix is not positive definite; the body can move freely, fix at least three nodes")
-        inverse, _ = lapack.dtrtri(lower, lower=1)
+        inverse, _ = trtri(lower, lower=1)
         inverse = np.ascontiguousarray(np.tril(inverse))
         below = dense[n:, :n] @ inverse.T
         inverses.append(inverse)
         belows.append(below)
         rest = dense[n:, n:].copy()
         if len(rest):
-            blas.dsyrk(-1, below.T, beta=1, c=rest.T, trans=1, overwrite_c=1)
+            syrk(-1, below.T, beta=1, c=rest.T, trans=1, overwrite_c=1)
         pending.append(rest)
         for child in front.children:
             pending[child] = None
@@ -135,7 +138,7 @@ def _assemble(permuted: csr_matrix, tree: Tree, front: Front, block: int, pendin
     start, stop = front.first * block, front.last * block
     border = _unknowns(front.border, block)
     unknowns = np.concatenate([np.arange(start, stop), border])
-    dense = np.zeros((len(unknowns), len(unknowns)))
+    dense = np.zeros((len(unknowns), len(unknowns)), permuted.dtype)
     span = slice(permuted.indptr[start], permuted.indptr[stop])
     column, value = permuted.indices[span], permuted.data[span]
     row = np.repeat(np.arange(stop - start), np.diff(permuted.indptr[start : stop + 1]))

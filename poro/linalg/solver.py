@@ -10,6 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 import pyamg
 from scipy.sparse import bsr_matrix, csr_matrix
+from scipy.sparse.linalg import LinearOperator, cg
 
 from poro.arrays import Array
 from poro.errors import SolverError
@@ -19,6 +20,7 @@ from poro.linalg.dissection import Tree, dissect
 # Numbers in a factor above which memory (8 bytes each) decides for the iterative solver.
 FACTOR_LIMIT = 150_000_000
 MAX_ITERATIONS = 200  # of multigrid
+MAX_STEPS = 30  # of conjugate gradients behind a factor in single precision; usually three
 
 
 class LinearSolver(Protocol):
@@ -62,6 +64,29 @@ class Multigrid:
         return x
 
 
+@dataclass(frozen=True)
+class SingleFactor:
+    """Conjugate gradients preconditioned by a Cholesky factor in single precision: half the time of a factor in double
+    precision where it serves one right-hand side. Stops at a relative residual of `tolerance`.
+    """
+
+    matrix: csr_matrix
+    factor: Cholesky
+    tolerance: float = 1e-12
+
+    def solve(self, right: Array) -> Array:
+        """Solution of the shape of `right`; raises SolverError when MAX_STEPS do not suffice."""
+        columns = [self._solve_one(b) for b in np.atleast_2d(right.T)]
+        return columns[0] if right.ndim == 1 else np.stack(columns, axis=1)
+
+    def _solve_one(self, right: Array) -> Array:
+        preconditioner = LinearOperator(self.matrix.shape, matvec=self.factor.solve, dtype=float)
+        x, info = cg(self.matrix, right, rtol=self.tolerance, atol=0.0, maxiter=MAX_STEPS, M=preconditioner)
+        if info:
+            raise SolverError(f"a factor in single precision did not lead to {self.tolerance:g} in {MAX_STEPS} steps")
+        return np.asarray(x)
+
+
 def rigid_body_modes(points: Array) -> Array:
     """Three translations and three rotations at points (n, 3), as columns (3n, 6)."""
     modes = np.zeros((len(points), 3, 6))
@@ -95,6 +120,18 @@ def linear_solver(
         blocked, B=near_null, strength=("symmetric", {"theta": 0.0}), max_coarse=300
     )
     return Multigrid(blocked, hierarchy)
+
+
+def solve_once(matrix: csr_matrix, points: Array, right: Array) -> Array:
+    """Solution of one right-hand side (n,), to a relative residual of 1e-12; a matrix as of `linear_solver`."""
+    block = matrix.shape[0] // len(points)
+    tree = elimination_tree(matrix, points)
+    if tree.factor_entries(block) <= FACTOR_LIMIT:
+        try:
+            return SingleFactor(matrix, cholesky(matrix, tree, block, np.float32)).solve(right)
+        except SolverError:  # too ill-conditioned for single precision
+            pass
+    return linear_solver(matrix, points, tree).solve(right)
 
 
 def inverse_at(solver: LinearSolver, unknowns: Array, size: int, dtype: type, batch: int = 384) -> Array:

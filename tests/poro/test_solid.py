@@ -28,8 +28,15 @@ from poro.fem.forms import (
     vector_basis,
 )
 from poro.fem.tissue import GRAVITY_KPA_PER_MM
-from poro.linalg import Multigrid, linear_solver
-from poro.linalg.solver import rigid_body_modes
+from poro.linalg.cholesky import cholesky
+from poro.linalg.solver import (
+    Multigrid,
+    SingleFactor,
+    elimination_tree,
+    linear_solver,
+    rigid_body_modes,
+    solve_once,
+)
 from poro.mesh import TetMesh
 
 TISSUE = Tissue()
@@ -192,6 +199,26 @@ def test_multigrid_agrees_with_the_factorization(poisson: float) -> None:
     assert (residuals[-1] / residuals[0]) ** (1 / (len(residuals) - 1)) < 0.5
     many = direct.solve(np.stack([right, 2 * right], 1))
     assert_allclose(many[:, 1], 2 * exact, rtol=1e-9, atol=1e-9 * np.abs(exact).max())
+
+
+def test_a_factor_in_single_precision_leads_to_the_same_answer() -> None:
+    mesh = ellipsoid(11.0)
+    anchored = stiffness(mesh, TISSUE.lame_kpa, TISSUE.shear_kpa) + 1e-3 * identity(3 * len(mesh.points))
+    right = np.random.default_rng(0).normal(size=3 * len(mesh.points))
+    exact = linear_solver(anchored.tocsr(), mesh.points).solve(right)
+    assert_allclose(solve_once(anchored.tocsr(), mesh.points, right), exact, rtol=0, atol=1e-9 * np.abs(exact).max())
+
+
+def test_where_single_precision_does_not_suffice_double_answers(monkeypatch: pytest.MonkeyPatch) -> None:
+    mesh = ellipsoid(25.0)
+    matrix = (stiffness(mesh, TISSUE.lame_kpa, TISSUE.shear_kpa) + identity(3 * len(mesh.points))).tocsr()
+    right = np.random.default_rng(0).normal(size=3 * len(mesh.points))
+    exact = linear_solver(matrix, mesh.points).solve(right)
+    monkeypatch.setattr(poro.linalg.solver, "MAX_STEPS", 1)
+    single = SingleFactor(matrix, cholesky(matrix, elimination_tree(matrix, mesh.points), 3, np.float32))
+    with pytest.raises(SolverError, match="in 1 steps"):
+        single.solve(right)
+    assert_allclose(solve_once(matrix, mesh.points, right), exact, rtol=1e-12)
 
 
 def test_multigrid_that_runs_out_of_iterations_says_so_with_its_residuals(monkeypatch: pytest.MonkeyPatch) -> None:
