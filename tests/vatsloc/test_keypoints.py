@@ -136,15 +136,15 @@ def test_where_few_are_found_more_are_looked_for_in_all_tissue(
     monkeypatch.setattr(module, "propagate_matches", propagate)
     monkeypatch.setattr(module, "FEW", few)
     find_correspondences(scene.prepared(), observed, np.zeros_like(observed.model_mesh.points), KeypointSettings())
-    assert [cell for _, cell in calls] == ([10.0] if few == 30 else [10.0, 7.0])
+    assert [cell for _, cell in calls] == ([10.0] if few == 30 else [10.0, 10.0, 7.0])
     first = calls[0][0].grid.points()[calls[0][0].inside]
     assert first[:, 0].max() < scene.CENTRE_DEF[0]
     if few == 31:
-        every = calls[1][0].grid.points()[calls[1][0].inside]
+        every = calls[2][0].grid.points()[calls[2][0].inside]
         assert every[:, 0].max() > scene.CENTRE_DEF[0] + 10
         assert len(every) > 1.6 * len(first)
-        gas = resample_mask(found.air, calls[1][0].grid).inside
-        assert not (gas & calls[1][0].inside).any()
+        gas = resample_mask(found.air, calls[2][0].grid).inside
+        assert not (gas & calls[2][0].inside).any()
 
 
 def test_under_the_right_map_both_images_show_the_same(observed: Any) -> None:
@@ -168,3 +168,34 @@ def test_the_modelled_lung_is_the_moved_mesh(observed: Any) -> None:
     points = scans.modelled.grid.points()[scans.modelled.inside]
     assert_allclose(points.mean(axis=0), scene.CENTRE_DEF, atol=0.3)
     assert scans.modelled.inside.sum() * 8 == pytest.approx(BEFORE.volumes.sum(), rel=0.02)
+
+
+def test_where_the_model_is_off_by_more_than_the_reach_places_to_all_sides_of_it_are_tried(
+    observed: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    truth = scene.collapsed(observed.model_mesh.points) - observed.model_mesh.points
+    off, settings = truth + np.array([0, 0, 13.0]), KeypointSettings(reach_mm=8.0)
+    found = find_correspondences(half_seen(), observed, off, settings)
+    error = np.linalg.norm(scene.collapsed(found.moving) - found.fixed, axis=1)
+    assert len(found) > 70
+    assert np.percentile(error, 90) < 2.0
+    monkeypatch.setattr(module, "FEW", 0)
+    there_alone = find_correspondences(half_seen(), observed, off, settings)
+    right = np.linalg.norm(scene.collapsed(there_alone.moving) - there_alone.fixed, axis=1) < 2.0
+    assert right.sum() < 0.5 * (error < 2.0).sum()
+
+
+def test_of_matches_that_share_a_keypoint_the_best_correlated_stays() -> None:
+    at = np.array([[1.0, 2, 3], [4, 5, 6], [1, 2, 3], [1, 2, 3]])
+    to = np.arange(12.0).reshape(4, 3)
+    best = module._consistent(Correspondences.of(at, to, np.array([0.5, 0.6, 0.9, 0.9])))
+    assert_array_equal(best.fixed, at[:2])
+    assert_array_equal(best.moving, to[[2, 1]])
+
+
+def test_a_match_counts_where_two_of_its_neighbours_move_alike() -> None:
+    at = np.stack([np.arange(20.0), np.zeros(20), np.zeros(20)], axis=1)
+    motion = np.where(at[:, :1] < 10, [[0.0, 0, 0]], [[30.0, 0, 0]])
+    motion[[4, 17]] += [[0, 9.0, 0], [0, 7.0, 0]]
+    kept = module._consistent(Correspondences.of(at, at - motion, np.ones(20)))
+    assert_array_equal(np.setdiff1d(at[:, 0], kept.fixed[:, 0]), [4])

@@ -1,10 +1,14 @@
 """Keypoints inside the lung matched between both cone-beam CTs: first about where a model of the collapse puts them,
-then by propagation from the matches to their neighbours. Where these are few, tissue without air is searched too.
+then by propagation from the matches to their neighbours. Where these are few, the model may be far off: they are looked
+for about places to all sides of it too, and in tissue without air.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
+
+import numpy as np
+from scipy.spatial import cKDTree
 
 from poro.mesh import TetMesh
 from registration.correspondences import Correspondences
@@ -23,6 +27,10 @@ RIM_MM = 2.0
 """Blocks nearer than this to the lung's border also show what lies beyond it."""
 FEW = 400
 """With fewer keypoints than this, more are looked for: in airless tissue, and one in every smaller cell."""
+SHIFT_MM = 12.0
+"""How far aside of the model keypoints are then looked for, less than the reach, so that no gap is left."""
+VOTERS, VOTES, ALIKE_MM = 6, 2, 8.0
+"""A match found there counts if so many of so many neighbours move as it does, within ALIKE_MM."""
 SHRUNK_CELL_MM = 7.0
 """What a cell of 10 mm becomes where the lung has shrunk to a third."""
 ROOM_MM, AIRLESS_MM, GAS_RIM_MM = 6.0, 25.0, 1.5
@@ -51,8 +59,26 @@ def find_correspondences(
     found = propagate_matches(deflated, placed, after, before, first, PropagationSettings(match))
     if len(found) >= FEW:
         return found
+    for shift in SHIFT_MM * np.concatenate([np.eye(3), -np.eye(3)]):
+        first = first.joined(_near_model(prepared, observed, displacement + shift, match))
+    found = propagate_matches(deflated, placed, after, before, _consistent(first), PropagationSettings(match))
     after, finer = _inner(tissue(prepared, observed, deflated), seen), replace(match, cell_mm=SHRUNK_CELL_MM)
     return propagate_matches(deflated, placed, after, before, found, PropagationSettings(finer))
+
+
+def _consistent(found: Correspondences) -> Correspondences:
+    """Of matches that share a keypoint, the one that correlates best, where two of its nearest neighbours move alike.
+
+    Lobes that have come apart move differently, so that a majority need not agree.
+    """
+    by_ncc = found.only(np.argsort(-found.ncc, kind="stable"))
+    best = by_ncc.only(np.unique(by_ncc.fixed, axis=0, return_index=True)[1])
+    if len(best) <= VOTERS:
+        return best
+    motion = best.fixed - best.moving
+    near = cKDTree(best.fixed).query(best.fixed, VOTERS + 1)[1][:, 1:]
+    alike = np.linalg.norm(motion[near] - motion[:, None], axis=2) < ALIKE_MM
+    return best.only(alike.sum(axis=1) >= VOTES)
 
 
 def tissue(prepared: Prepared, observed: Observed, deflated: Volume) -> Mask:
