@@ -25,11 +25,8 @@ from vatsloc.formats.images import files_behind, read_volume_and_warnings, state
 from vatsloc.formats.markups import PointList, read_points
 from vatsloc.formats.meshes import Surface
 from vatsloc.frames import reorient
-from vatsloc.imaging.cbct import PreparedCbct, prepare_cbct
 from vatsloc.imaging.greyvalues import Calibration
-from vatsloc.imaging.side import PleuralGas as ShownGas
-from vatsloc.imaging.side import nodule_side, pleural_gas
-from vatsloc.imaging.spine import Spine, segment_spine
+from vatsloc.imaging.side import SeenScans, ToldSide, nodule_side, told_side
 from vatsloc.marks import AXES, Nodule, NoduleSource, inside_of, mask_on, one_point, read_hint_surface, read_nodule
 
 IMAGES = ("ct", "cbct_inflated", "cbct_deflated")
@@ -55,7 +52,8 @@ class CaseBefore:
 
     side: of the operated lung; cbct_inflated: None where it was not taken, or not yet; gravity_ras: unit (3,) in the
     CBCT's frame; input_sha256 and stored_axes: by name of the input; warnings: sentences for the report; calibration:
-    what made images HU, by name of those that were not; side_told_by: "case.toml", "nodule" or "pleural gas".
+    what made images HU, by name of those that were not; side_told_by: "case.toml", "nodule" or "pleural gas";
+    seen: the cone-beam CTs as prepared, where gas told it.
     """
 
     folder: Path
@@ -71,6 +69,7 @@ class CaseBefore:
     warnings: tuple[str, ...] = ()
     calibration: Mapping[str, Calibration] = field(default_factory=dict)
     side_told_by: str = FILE_NAME
+    seen: SeenScans | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,9 +103,9 @@ def read_case(folder: Path) -> Case:
     file = read_case_file(folder)
     read = _read(folder, file, tuple(name for name in IMAGES if name != "cbct_inflated" or file.images.cbct_inflated))
     images, inflated = read.images, read.images.get("cbct_inflated")
-    side, told_by = read.side or told_side(images["ct"], inflated, images["cbct_deflated"], read.nodule)
-    known = _known(read, side, told_by)
-    return Case(**known, cbct_inflated=inflated, cbct_deflated=images["cbct_deflated"])
+    deflated, nodule = images["cbct_deflated"], read.nodule
+    told = read.side or told_side(images["ct"], nodule.mask, nodule.centre_ras, inflated, deflated)
+    return Case(**_known(read, told), cbct_inflated=inflated, cbct_deflated=deflated)
 
 
 def read_case_before(folder: Path, wanted: tuple[str, ...] = ("ct", "cbct_inflated")) -> CaseBefore:
@@ -120,26 +119,26 @@ def read_case_before(folder: Path, wanted: tuple[str, ...] = ("ct", "cbct_inflat
     there = ("ct",) if inflated is None or not (folder / inflated).exists() else ("ct", "cbct_inflated")
     taken = tuple(name for name in wanted if name in there)
     read = _read(folder, file, taken)
-    side = nodule_side(read.images["ct"], read.nodule.mask, read.nodule.centre_ras)
-    told = read.side or (None if side is None else (side, "nodule"))
-    if told is None:
+    side = read.side or nodule_side(read.images["ct"], read.nodule.mask, read.nodule.centre_ras)
+    if side is None:
         raise InputRefused(
             "The nodule's place in the CT does not tell the operated side, and no deflated CBCT is there to tell it; "
             'add side = "right" or side = "left" to case.toml.'
         )
-    return CaseBefore(**_known(read, *told), cbct_inflated=read.images.get("cbct_inflated"))
+    told = side if isinstance(side, ToldSide) else ToldSide(side, "nodule")
+    return CaseBefore(**_known(read, told), cbct_inflated=read.images.get("cbct_inflated"))
 
 
 @dataclass(frozen=True)
 class _Read:
-    """Images of a folder by name, in HU, and what belongs to them. side: as case.toml states it, and that it does."""
+    """Images of a folder by name, in HU, and what belongs to them. side: as case.toml states it."""
 
     folder: Path
     file: CaseFile
     images: dict[str, Volume]
     axes: dict[str, str]
     nodule: Nodule
-    side: tuple[Side, str] | None
+    side: ToldSide | None
     hints: Hints
     sha256: dict[str, str]
     warnings: list[str]
@@ -169,7 +168,7 @@ def _read(folder: Path, file: CaseFile, taken: tuple[str, ...]) -> _Read:
         images=images,
         axes=dict(zip(taken, axes, strict=True)),
         nodule=read_nodule(source, grids["ct"], warnings),
-        side=(file.side, FILE_NAME) if file.side else None,
+        side=ToldSide(file.side, FILE_NAME) if file.side else None,
         hints=_hints(file, paths, grids, frame, warnings),
         sha256=input_sha256,
         warnings=warnings,
@@ -177,49 +176,23 @@ def _read(folder: Path, file: CaseFile, taken: tuple[str, ...]) -> _Read:
     )
 
 
-def _known(read: _Read, side: Side, told_by: str) -> dict[str, Any]:
+def _known(read: _Read, told: ToldSide) -> dict[str, Any]:
     """Fields that every case has."""
     return {
         "folder": read.folder,
-        "side": side,
+        "side": told.side,
         "ct": read.images["ct"],
         "nodule": read.nodule,
-        "gravity_ras": _gravity(side, read.file.setup.gravity_cbct),
+        "gravity_ras": _gravity(told.side, read.file.setup.gravity_cbct),
         "pleural_gas": read.file.setup.pleural_gas,
         "hints": read.hints,
         "input_sha256": read.sha256,
         "stored_axes": read.axes,
         "warnings": tuple(read.warnings),
         "calibration": read.calibration,
-        "side_told_by": told_by,
+        "side_told_by": told.by,
+        "seen": told.seen,
     }
-
-
-def told_side(ct: Volume, inflated: Volume | None, deflated: Volume, nodule: Nodule) -> tuple[Side, str]:
-    """The operated side, and what told it: the lung that holds the nodule, else the pleural gas.
-
-    Raises InputRefused where neither does; `prepare` refuses a nodule and gas that contradict each other.
-    """
-    side = nodule_side(ct, nodule.mask, nodule.centre_ras)
-    if side is not None:
-        return side, "nodule"
-    side = shown_gas(inflated, deflated).side
-    if side is None:
-        raise InputRefused(
-            "Neither the nodule's place in the CT nor pleural gas in the deflated CBCT tells the operated side; "
-            'add side = "right" or side = "left" to case.toml.'
-        )
-    return side, "pleural gas"
-
-
-def shown_gas(inflated: Volume | None, deflated: Volume) -> ShownGas:
-    """Pleural gas in cone-beam CTs as they come."""
-    return pleural_gas(None if inflated is None else _with_spine(inflated), _with_spine(deflated))
-
-
-def _with_spine(image: Volume) -> tuple[PreparedCbct, Spine]:
-    cbct = prepare_cbct(image)
-    return cbct, segment_spine(cbct.volume, cbct.field.usable)
 
 
 def read_landmarks(folder: Path) -> Landmarks:

@@ -5,8 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import traceback
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 from threading import Event
 from typing import Annotated, Literal
@@ -18,9 +17,10 @@ import typer
 os.environ["OPENBLAS_NUM_THREADS"] = "1"
 
 from vatsloc.errors import GateFailed, as_ours
+from vatsloc.listen_command import listen
 from vatsloc.phantom_command import phantom
 from vatsloc.study.commands import bench, stability
-from vatsloc.terminal import JsonOption, progress, say, show, show_line
+from vatsloc.terminal import JsonOption, LinkOption, link, progress, say, show, show_line
 
 app = typer.Typer(
     add_completion=False,
@@ -31,16 +31,11 @@ app = typer.Typer(
 app.add_typer(bench, name="bench")
 app.add_typer(stability, name="stability")
 app.command()(phantom)
+app.command()(listen)
 
 DEBUG = "--debug"
 
 CaseArgument = Annotated[Path, typer.Argument(metavar="CASE", help="Case folder with case.toml.")]
-
-
-LinkOption = Annotated[
-    int | None,
-    typer.Option(metavar="PORT", min=1, max=65535, help='Serve the answer by OpenIGTLink (extra "navigation").'),
-]
 
 
 @app.callback()
@@ -68,7 +63,7 @@ def localize(
     from vatsloc.workflow.settings import load_settings
 
     answered = (lambda answer: show_line({"event": "answer", **answer})) if json_lines else None
-    with _link(openigtlink) as publish:
+    with link(openigtlink) as publish:
         with progress() as tell:
             run = run_case(case, out, load_settings(preset, settings), tell, state, answered)
         if json_lines:
@@ -219,45 +214,6 @@ def export_dicom(
 
 
 @app.command()
-def listen(
-    port: Annotated[int, typer.Option(metavar="N", min=0, max=65535, help="Port to listen on.")],
-    cases: Annotated[Path, typer.Option(metavar="DIR", help="Folder for what arrives and for the answers.")],
-    nodule: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE|DIR", help="Nodule in the CT, or a folder of files named by patient ID."),
-    ] = None,
-    ct: Annotated[Path | None, typer.Option("--ct", metavar="DIR", help="CT that is here already, as DICOM.")] = None,
-    patient: Annotated[str, typer.Option(metavar="ID", help="Patient whom the file of --nodule is about.")] = "",
-    send: Annotated[str | None, typer.Option(metavar="[TITLE@]HOST:PORT", help="Node that gets the answers.")] = None,
-    allow: Annotated[str, typer.Option(metavar="A,B,..", help="Titles of callers; all others are refused.")] = "",
-    title: Annotated[str, typer.Option(metavar="TITLE", help="Own application entity title.")] = "VATSLOC",
-    preset: Annotated[str, typer.Option(metavar="NAME", help="fast, balanced, accurate or auto.")] = "balanced",
-    settle: Annotated[float, typer.Option(metavar="S", min=0, help="Silence after which a series may be whole.")] = 5.0,
-    timeout: Annotated[float, typer.Option(metavar="S", min=1, help="Silence after which one is given up.")] = 120.0,
-    openigtlink: LinkOption = None,
-) -> None:
-    """Take scans that are pushed by DICOM, answer, and send the answer on (extra "dicom")."""
-    from vatsloc.dicomnet.arrival import Patience
-    from vatsloc.dicomnet.listen import Node, import_series, require_pynetdicom
-    from vatsloc.dicomnet.listen import listen as serve
-    from vatsloc.dicomnet.nodule import NoduleFiles
-    from vatsloc.dicomnet.sending import target_of
-    from vatsloc.dicomnet.work import real_work
-    from vatsloc.workflow.settings import load_settings
-
-    require_pynetdicom()
-    load_settings(preset, None)
-    target = None if send is None else target_of(send)
-    whose = import_series(cases, ct) if ct is not None else ""
-    nodules = None if nodule is None else NoduleFiles(nodule, patient or whose)
-    callers = tuple(word.strip() for word in allow.split(",") if word.strip())
-    with _link(openigtlink) as publish, suppress(KeyboardInterrupt):
-        node = Node(cases, port, title, callers, target, Patience(settle, timeout), publish)
-        serve(node, nodules, real_work(preset), say)
-    say("stopped; start it again to go on")
-
-
-@app.command()
 def cohort(
     folders: Annotated[
         list[Path], typer.Argument(metavar="DIR...", help="Case folders, or folders that hold case folders.")
@@ -344,20 +300,6 @@ def paper(
     require_matplotlib()
     write_paper(run_paper(find_cases(folders), out, jobs, say), out)
     print(out / "paper.md")
-
-
-@contextmanager
-def _link(port: int | None) -> Iterator[Callable[[Path, str], None]]:
-    """What publishes a result to navigation screens while the block runs; nothing where no port is given."""
-    if port is None:
-        yield lambda result, patient: None
-        return
-    from vatsloc.navigation import messages_of, serving
-    from vatsloc.navigation.messages import require_pyigtl
-
-    require_pyigtl()
-    with serving(port) as link:
-        yield lambda result, patient: link.publish(messages_of(result, patient))
 
 
 def _until_interrupted(sentence: str) -> None:

@@ -13,13 +13,14 @@ from typing import Any
 import numpy as np
 
 from registration.volume import Array, Grid, Volume
-from vatsloc.case import Case, image_overlap, read_case, shown_gas
+from vatsloc.case import Case, image_overlap, read_case
 from vatsloc.errors import CaseError, InputRefused, VatslocError
 from vatsloc.formats.casefile import FILE_NAME
 from vatsloc.formats.folder import whole_folder
 from vatsloc.formats.images import files_behind
 from vatsloc.formats.markups import PointList, write_points
 from vatsloc.imaging.greyvalues import peaks
+from vatsloc.imaging.side import pleural_gas, seen_scans
 
 LONG_SUFFIXES = (".nii.gz", ".mrk.json", ".seg.nrrd")
 POINT_SUFFIXES = (".mrk.json", ".json", ".fcsv")
@@ -147,7 +148,7 @@ def _write_case_file(folder: Path, case: Case | None, names: Mapping[str, str], 
 
 def _told(case: Case) -> dict[str, Any]:
     images: dict[str, Volume] = {name: getattr(case, name) for name in case.scans}
-    gas = shown_gas(case.cbct_inflated, case.cbct_deflated)
+    gas = pleural_gas(case.seen or seen_scans(case.cbct_inflated, case.cbct_deflated))
     gas.require(case.side, case.side_told_by)
     return {
         "images": {name: _image(case, name, image) for name, image in images.items()},

@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Annotated, Any
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
 
 import typer
 
+Options = TypeVar("Options")
+
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout.")]
+LinkOption = Annotated[
+    int | None,
+    typer.Option(metavar="PORT", min=1, max=65535, help='Serve the answer by OpenIGTLink (extra "navigation").'),
+]
 
 
 def say(message: str) -> None:
@@ -80,3 +88,31 @@ def progress() -> Iterator[Callable[[str], None]]:
                 bar.console.print(message, markup=False, highlight=False)
 
         yield tell
+
+
+@contextmanager
+def link(port: int | None) -> Iterator[Callable[[Path, str], None]]:
+    """What publishes a result to navigation screens while the block runs; nothing where no port is given."""
+    if port is None:
+        yield lambda result, patient: None
+        return
+    from vatsloc.navigation import messages_of, serving
+    from vatsloc.navigation.messages import require_pyigtl
+
+    require_pyigtl()
+    with serving(port) as screens:
+        yield lambda result, patient: screens.publish(messages_of(result, patient))
+
+
+def taking(options: type[Options]) -> Callable[[Callable[[Options], None]], Callable[..., None]]:
+    """Make a function of a settings object a command: the object's fields, annotated for typer, are its options."""
+
+    def command_of(act: Callable[[Options], None]) -> Callable[..., None]:
+        def command(**given: Any) -> None:
+            act(options(**given))
+
+        command.__name__, command.__doc__ = act.__name__, act.__doc__
+        command.__signature__ = inspect.signature(options, eval_str=True)  # type: ignore[attr-defined]
+        return command
+
+    return command_of

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import subprocess
+import json
 import sys
 import threading
 import time
@@ -23,6 +23,7 @@ from vatsloc.dicomnet.arrival import Patience
 from vatsloc.dicomnet.listen import Node, listen
 from vatsloc.dicomnet.nodule import NoduleFiles
 from vatsloc.dicomnet.sending import Target
+from vatsloc.dicomnet.store import patient_folder
 from vatsloc.dicomnet.work import Work
 from vatsloc.dicomout.export import dicom_of_run, write_objects
 from vatsloc.formats.casefile import read_case_file
@@ -144,26 +145,10 @@ def running(
     assert broken == []
 
 
-def push(port: int, *paths: Path, title: str = "SCANNER", options: tuple[str, ...] = ()) -> int:
-    """Exit code of dcmtk's storescu."""
-    command = ["storescu", "-aet", title, "-aec", "VATSLOC", *options, "+sd", "127.0.0.1", str(port), *map(str, paths)]
-    return subprocess.run(command, capture_output=True, timeout=120, check=False).returncode
-
-
-@contextmanager
-def archive(folder: Path, port: int) -> Iterator[Path]:
-    """dcmtk's storescp, which keeps what it is sent."""
-    folder.mkdir(exist_ok=True)
-    command = ["storescp", "-od", str(folder), "-aet", "ARCHIVE", "+xa", str(port)]
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
-        try:
-            end = time.monotonic() + 20
-            while subprocess.run(["echoscu", "127.0.0.1", str(port)], capture_output=True, check=False).returncode:
-                assert time.monotonic() < end
-                time.sleep(0.1)
-            yield folder
-        finally:
-            process.terminate()
+def status(node: Running, patient: str) -> dict:
+    """What the node says of a patient on disk."""
+    found: dict = json.loads((node.cases / patient_folder(patient) / "status.json").read_text())
+    return found
 
 
 def nodule_files(folder: Path, *patients: str) -> NoduleFiles:

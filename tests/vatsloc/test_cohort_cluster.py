@@ -17,6 +17,7 @@ from pathlib import Path
 import pytest
 from distributed import Client, LocalCluster
 
+from tests.vatsloc.dcmtk import free_port
 from vatsloc.errors import CaseError
 from vatsloc.study.cohort.cohort import LOST, progress, run_cohort
 from vatsloc.study.cohort.job import Job, NotSeen, program_of, run_one, threads_of
@@ -118,12 +119,6 @@ def test_threads_are_those_of_the_worker(
 
 def set_threads(n: str) -> None:
     os.environ["NUMBA_NUM_THREADS"] = n
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 class Cluster:
@@ -231,6 +226,6 @@ def lost(job: Job) -> None:
     raise KilledWorker(job.case.name)
 
 
-def test_progress_tells_what_is_done_and_what_is_left() -> None:
+def test_progress_tells_what_is_done_and_what_is_left_and_at_the_end_the_pace() -> None:
     assert progress(5, 20, 4, 480.0) == "[#####...............] 5/20, 30 min left;"
-    assert progress(20, 20, 4, 480.0) == "[####################] 20/20;"
+    assert progress(20, 20, 4, 480.0) == "[####################] 20/20, 30 cases per hour;"

@@ -1,15 +1,7 @@
-"""The DICOM node on loopback, with dcmtk as scanner and archive: what comes in whole, and only that, is answered."""
+"""The DICOM node on loopback, with dcmtk as scanner and archive: what has come in whole is answered and sent."""
 
 from __future__ import annotations
 
-import errno
-import json
-import os
-import shutil
-import signal
-import socket
-import subprocess
-import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -19,18 +11,17 @@ import pydicom
 import pytest
 
 from tests.vatsloc import node_scene as scene
+from tests.vatsloc.dcmtk import archive, free_port, needs_dcmtk, push
 from tests.vatsloc.dicom_scene import Ids, write_series
 from tests.vatsloc.finding_scene import scan
-from vatsloc.dicomnet import store as store_module
 from vatsloc.dicomnet.listen import import_series
 from vatsloc.dicomnet.nodule import NoduleFiles
 from vatsloc.dicomnet.sending import Target
-from vatsloc.dicomnet.server import serving
-from vatsloc.dicomnet.store import Store, patient_folder
+from vatsloc.dicomnet.store import patient_folder
 from vatsloc.dicomout.export import SEG_FILE
 from vatsloc.errors import CaseError, InputRefused
 
-pytestmark = pytest.mark.skipif(shutil.which("storescu") is None, reason="dcmtk is not installed")
+pytestmark = needs_dcmtk
 
 
 @pytest.fixture(scope="module")
@@ -44,27 +35,16 @@ def nodules(tmp_path: Path) -> NoduleFiles:
     return scene.nodule_files(tmp_path / "nodules", "A-1", "B-2")
 
 
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
-def status(node: scene.Running, patient: str) -> dict:
-    found: dict = json.loads((node.cases / patient_folder(patient) / "status.json").read_text())
-    return found
-
-
 def test_three_series_pushed_come_back_as_segmentation_and_report(
     tmp_path: Path, scans: dict[str, dict[str, Path]], nodules: NoduleFiles
 ) -> None:
     port = free_port()
     with (
-        scene.archive(tmp_path / "archive", port) as received,
+        archive(tmp_path / "archive", port) as received,
         scene.running(tmp_path / "cases", nodules, target=Target("127.0.0.1", port, "ARCHIVE")) as node,
     ):
         for role in ("deflated", "ct", "inflated"):  # the order of arrival tells nothing
-            assert scene.push(node.port, scans["A-1"][role]) == 0
+            assert push(node.port, scans["A-1"][role]) == 0
         node.wait_said("sent to ARCHIVE")
         files = sorted(received.iterdir())
     assert len(files) == 2
@@ -78,7 +58,7 @@ def test_three_series_pushed_come_back_as_segmentation_and_report(
     frames = seg.PerFrameFunctionalGroupsSequence
     named = {str(f.DerivationImageSequence[0].SourceImageSequence[0].ReferencedSOPInstanceUID) for f in frames}
     assert named <= own
-    told = status(node, "A-1")
+    told = scene.status(node, "A-1")
     assert sorted((s["role"], s["state"]) for s in told["series"].values()) == [
         ("CT", "whole"),
         ("deflated", "whole"),
@@ -96,7 +76,7 @@ def test_two_patients_pushed_at_once_in_one_association_are_kept_apart(
     for n, file in enumerate(sorted(files, key=lambda f: f.name)):  # names interleave patients and series
         (mixed / f"{n:04d}.dcm").symlink_to(file)
     with scene.running(tmp_path / "cases", nodules) as node:
-        assert scene.push(node.port, mixed) == 0
+        assert push(node.port, mixed) == 0
         node.wait(lambda: len(node.results()) == 2)
     for patient, other in (("A-1", "B-2"), ("B-2", "A-1")):
         folder = node.cases / patient_folder(patient)
@@ -108,223 +88,22 @@ def test_two_patients_pushed_at_once_in_one_association_are_kept_apart(
         assert not list(folder.rglob(f"{other}.nii.gz"))
 
 
-def test_titles_that_are_not_allowed_are_refused(
-    tmp_path: Path, scans: dict[str, dict[str, Path]], nodules: NoduleFiles
-) -> None:
-    with scene.running(tmp_path / "cases", nodules, allow=("C-ARM", "CT1")) as node:
-        assert scene.push(node.port, scans["A-1"]["ct"], title="STRANGER") != 0
-        node.wait_said("association refused: STRANGER at 127.0.0.1 is not among the titles of --allow")
-        assert node.cases.is_dir()
-        assert list(node.cases.iterdir()) == []
-        assert scene.push(node.port, scans["A-1"]["ct"], title="CT1") == 0
-        node.wait_said("CT of 8 images")
-
-
-def test_a_series_with_a_gap_waits_is_given_up_and_taken_up_again(
-    tmp_path: Path, scans: dict[str, dict[str, Path]], nodules: NoduleFiles
-) -> None:
-    part, rest = tmp_path / "part", tmp_path / "rest"
-    part.mkdir()
-    rest.mkdir()
-    for file in scans["A-1"]["deflated"].iterdir():
-        where = rest if int(pydicom.dcmread(file).InstanceNumber) in (11, 12) else part
-        (where / file.name).symlink_to(file)
-    with scene.running(tmp_path / "cases", nodules) as node:
-        for series in (scans["A-1"]["ct"], scans["A-1"]["inflated"], part):
-            assert scene.push(node.port, series) == 0
-        node.wait(lambda: "waiting for the rest" in json.dumps(status(node, "A-1")))
-        assert node.results() == []
-        node.wait_said("given up after 32 images")
-        (said,) = [s for s in node.said if "given up" in s]
-        assert "misses slices between" in said
-        assert node.results() == []
-        assert scene.push(node.port, rest) == 0
-        node.wait(lambda: len(node.results()) == 1)
-
-
-def test_a_sender_that_breaks_off_at_the_end_is_not_answered_until_it_sends_again(
-    tmp_path: Path, scans: dict[str, dict[str, Path]], nodules: NoduleFiles
-) -> None:
-    """The slices that came are even, so nothing but the abort tells that the last ones are missing."""
-    part = tmp_path / "part"
-    part.mkdir()
-    for file in scans["A-1"]["deflated"].iterdir():
-        if int(pydicom.dcmread(file).InstanceNumber) <= 20:
-            (part / file.name).symlink_to(file)
-    with scene.running(tmp_path / "cases", nodules) as node:
-        assert scene.push(node.port, scans["A-1"]["ct"], scans["A-1"]["inflated"]) == 0
-        scene.push(node.port, part, options=("--abort",))
-        node.wait_said("broke off")
-        node.wait_said("given up after 20 images: the sender broke off after 20 images; push the series again.")
-        assert node.results() == []
-        assert scene.push(node.port, scans["A-1"]["deflated"]) == 0  # 20 of them for the second time
-        node.wait(lambda: len(node.results()) == 1)
-    assert pydicom.dcmread(node.results()[0] / SEG_FILE).ReferencedSeriesSequence[0].ReferencedInstanceSequence[33]
-
-
-def test_a_series_of_fewer_images_than_it_states_waits(tmp_path: Path, nodules: NoduleFiles) -> None:
-    folder = write_series(tmp_path / "plain", scan(), scene.ids("A-1", "deflated"))
-    stated = scene.reworded(folder, tmp_path / "stated", NumberOfSeriesRelatedInstances="40")
-    with scene.running(tmp_path / "cases", nodules) as node:
-        assert scene.push(node.port, stated) == 0
-        node.wait_said("given up after 34 images: 34 images of 40 have arrived; push the series again.")
-
-
-def test_duplicates_change_nothing_and_an_impostor_is_refused(
-    tmp_path: Path, scans: dict[str, dict[str, Path]], nodules: NoduleFiles
-) -> None:
-    answered = []
-
-    def count(case: Path, state: Path, out: Path) -> None:
-        answered.append(case)
-        scene.fast_answer(case, state, out)
-
-    work = replace(scene.FAST_WORK, answer=count)
-    with scene.running(tmp_path / "cases", nodules, work) as node:
-        for series in scans["A-1"].values():
-            assert scene.push(node.port, series) == 0
-        node.wait(lambda: len(node.results()) == 1)
-        before = {file: file.read_bytes() for file in node.cases.rglob("slices/*.dcm")}
-        assert scene.push(node.port, scans["A-1"]["deflated"]) == 0
-        changed = scene.reworded(scans["A-1"]["deflated"], tmp_path / "changed", RescaleIntercept="-24")
-        scene.push(node.port, changed)
-        node.wait_said("another image with the same SOPInstanceUID is here already")
-        time.sleep(3 * scene.FAST.settle_s)
-        assert {file: file.read_bytes() for file in node.cases.rglob("slices/*.dcm")} == before
-    assert len(answered) == 1
-
-
-@pytest.mark.parametrize(
-    ("changes", "says"),
-    [
-        ({"PatientBirthDate": "19700101"}, "its patient ID is here with another name or birth date"),
-        ({"PatientName": "Somebody^Else"}, "its patient ID is here with another name or birth date"),
-        ({"PatientID": "B-2"}, "its series is that of another patient"),
-        ({"FrameOfReferenceUID": "1.2.3"}, "its frame of reference is not that of the other images of its series"),
-        ({"PatientID": ""}, "it states no PatientID"),
-        ({"FrameOfReferenceUID": ""}, "it states no FrameOfReferenceUID"),
-    ],
-)
-def test_what_cannot_belong_together_is_refused(
-    changes: dict[str, str], says: str, tmp_path: Path, scans: dict[str, dict[str, Path]], nodules: NoduleFiles
-) -> None:
-    other = scene.reworded(scans["A-1"]["ct"], tmp_path / "other", **changes)
-    with scene.running(tmp_path / "cases", nodules) as node:
-        assert scene.push(node.port, scans["A-1"]["ct"]) == 0
-        assert scene.push(node.port, other) != 0
-        node.wait_said(says)
-        assert sum(1 for _ in node.cases.rglob("slices/*.dcm")) == 8
-
-
-def test_one_name_written_in_two_ways_is_one_patient() -> None:
-    one = store_module.Patient("A-1", "Doe^Jane^^", "19600101")
-    assert not one.contradicts(store_module.Patient("A-1", "DOE JANE", ""))
-    assert one.contradicts(store_module.Patient("A-1", "Doe^Jane", "19600102"))
-    assert one.contradicts(store_module.Patient("A-2", "Doe^Jane", "19600101"))
-
-
-def test_ids_that_look_alike_as_folders_are_not_one() -> None:
-    names = [patient_folder(i) for i in ("A/1", "A 1", "A_1", "../1", "x" * 100, "x" * 101)]
-    assert len(set(names)) == 6
-    assert all("/" not in name and "." not in name for name in names)
-
-
-def test_a_full_disk_is_told_to_the_sender_and_loses_nothing(
-    tmp_path: Path, scans: dict[str, dict[str, Path]], nodules: NoduleFiles, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with scene.running(tmp_path / "cases", nodules) as node:
-        assert scene.push(node.port, scans["A-1"]["ct"]) == 0
-
-        def full(_: int) -> None:
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-        with monkeypatch.context() as patched:
-            patched.setattr(store_module.os, "fsync", full)
-            assert scene.push(node.port, scans["A-1"]["inflated"]) != 0
-            node.wait_said("no space left on the disk of the receiver")
-        assert list(node.cases.rglob("partial-*")) == []
-        assert sum(1 for _ in node.cases.rglob("slices/*.dcm")) == 8
-        for role in ("inflated", "deflated"):
-            assert scene.push(node.port, scans["A-1"][role]) == 0
-        node.wait(lambda: len(node.results()) == 1)
-
-
-class Process:
-    """A node in a process of its own."""
-
-    def __init__(self, cases: Path, nodules: NoduleFiles, seconds: float) -> None:
-        command = [sys.executable, "-m", "tests.vatsloc.node_scene", str(cases), str(nodules.path), str(seconds)]
-        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=scene.ROOT)
-        self.port = int(self.until("PORT ").split()[-1])
-
-    def until(self, text: str) -> str:
-        assert self.process.stdout is not None
-        for line in self.process.stdout:
-            if text in line:
-                return line
-        raise AssertionError(f"the node ended without saying {text}")
-
-    def kill(self) -> None:
-        self.process.send_signal(signal.SIGKILL)
-        self.process.wait()
-        assert self.process.stdout is not None
-        self.process.stdout.close()
-
-
-def test_kill_and_restart_lose_nothing(tmp_path: Path, scans: dict[str, dict[str, Path]], nodules: NoduleFiles) -> None:
-    """Killed in the middle of a series, then in the middle of an answer."""
-    cases = tmp_path / "cases"
-    first = Process(cases, nodules, 0.0)
-    try:
-        assert scene.push(first.port, scans["A-1"]["ct"], scans["A-1"]["inflated"]) == 0
-        sender = subprocess.Popen(
-            ["storescu", "-aec", "VATSLOC", "+sd", "127.0.0.1", str(first.port), str(scans["A-1"]["deflated"])],
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )
-        end = time.monotonic() + 30
-        while sum(1 for _ in cases.rglob("slices/*.dcm")) <= 8 + 31 + 5:  # CT, inflated, some of the deflated
-            assert time.monotonic() < end
-    finally:
-        first.kill()
-    sender.wait(30)
-    kept = {file.name for file in cases.rglob("slices/*.dcm")}
-    second = Process(cases, nodules, 600.0)
-    try:
-        assert kept <= {file.name for file in cases.rglob("slices/*.dcm")}
-        assert len(kept) < 8 + 31 + 34
-        second.until("given up after")  # the half series is known as half, and waits
-        assert list(cases.glob("*/answers/*")) == []
-        assert scene.push(second.port, scans["A-1"]["deflated"]) == 0
-        second.until("answering")
-    finally:
-        second.kill()
-    assert list(cases.glob("*/answers/*/result")) == []
-    third = Process(cases, nodules, 0.0)
-    try:
-        third.until("answered in")
-    finally:
-        third.kill()
-    (result,) = cases.glob("*/answers/*/result")
-    assert pydicom.dcmread(result / SEG_FILE).PatientID == "A-1"
-
-
 def test_an_archive_that_is_down_gets_the_answer_when_it_is_up_also_after_a_restart(
     tmp_path: Path, scans: dict[str, dict[str, Path]], nodules: NoduleFiles
 ) -> None:
     port = free_port()
     target = Target("127.0.0.1", port, "ARCHIVE")
     with scene.running(tmp_path / "cases", nodules, target=target) as node:
-        assert scene.push(node.port, *scans["A-1"].values()) == 0
+        assert push(node.port, *scans["A-1"].values()) == 0
         node.wait_said(f"not sent, tried again from time to time: ARCHIVE@127.0.0.1:{port} does not answer")
     with scene.running(tmp_path / "cases", nodules, target=target) as node:
         node.wait_said("not sent")
-        with scene.archive(tmp_path / "archive", port) as received:
+        with archive(tmp_path / "archive", port) as received:
             node.wait_said("sent to ARCHIVE")
             assert len(list(received.iterdir())) == 2
             assert not any("answering" in sentence for sentence in node.said)
     with (
-        scene.archive(tmp_path / "archive2", port) as received,
+        archive(tmp_path / "archive2", port) as received,
         scene.running(node.cases, nodules, target=target) as node,
     ):
         node.wait(lambda: (node.cases / patient_folder("A-1") / "status.json").exists())
@@ -341,7 +120,7 @@ def test_one_answer_that_fails_is_said_and_stops_no_other_and_is_tried_after_a_r
         scene.fast_answer(case, state, out)
 
     with scene.running(tmp_path / "cases", nodules, replace(scene.FAST_WORK, answer=picky)) as node:
-        assert scene.push(node.port, *scans["A-1"].values(), *scans["B-2"].values()) == 0
+        assert push(node.port, *scans["A-1"].values(), *scans["B-2"].values()) == 0
         node.wait(lambda: len(node.results()) == 1)
         node.wait_said("no answer: The deflated CBCT shows no lung; give another one.")
         time.sleep(1.5)
@@ -356,7 +135,7 @@ def test_a_patient_without_a_nodule_is_said_and_not_answered_with_another_s(
     one = tmp_path / "nodule.nii.gz"
     one.write_bytes(b"nodule of A-1")
     with scene.running(tmp_path / "cases", NoduleFiles(one, "A-1")) as node:
-        assert scene.push(node.port, *scans["B-2"].values(), *scans["A-1"].values()) == 0
+        assert push(node.port, *scans["B-2"].values(), *scans["A-1"].values()) == 0
         node.wait_said("no nodule is known of patient B-2; give one by --nodule.")
         node.wait(lambda: len(node.results()) == 1)
         assert node.results()[0].parents[2].name == patient_folder("A-1")
@@ -381,32 +160,18 @@ def test_scans_are_prepared_before_the_deflated_one_comes(
 
     work = replace(scene.FAST_WORK, prepare=prepare, answer=answer)
     with scene.running(tmp_path / "cases", nodules, work) as node:
-        assert scene.push(node.port, scans["A-1"]["ct"]) == 0
+        assert push(node.port, scans["A-1"]["ct"]) == 0
         node.wait_said("prepared in")
-        assert scene.push(node.port, scans["A-1"]["inflated"]) == 0
+        assert push(node.port, scans["A-1"]["inflated"]) == 0
         node.wait_said("prepared in", times=2)
     assert ["cbct_inflated" in text for text in seen] == [False, True]
     assert not any("cbct_deflated" in text for text in seen)
     with scene.running(tmp_path / "cases", nodules, work) as node:  # what was prepared is known after a restart
-        assert scene.push(node.port, scans["A-1"]["deflated"]) == 0
+        assert push(node.port, scans["A-1"]["deflated"]) == 0
         node.wait(lambda: len(node.results()) == 1)
         node.wait_said("not from what was prepared (the state is of another version of the program")
     assert with_state == [True, False]  # a state that is refused costs no answer
     assert len(seen) == 2
-
-
-def test_two_nodes_do_not_share_a_folder_or_a_port(tmp_path: Path, nodules: NoduleFiles) -> None:
-    with scene.running(tmp_path / "cases", nodules) as node:
-        with (
-            pytest.raises(CaseError, match="is served by another vatsloc listen"),
-            scene.running(tmp_path / "cases", nodules),
-        ):
-            pass
-        with (
-            pytest.raises(CaseError, match=f"port {node.port} cannot be opened"),
-            serving(Store(tmp_path / "more"), node.port, "X", (), print, 5.0),
-        ):
-            pass
 
 
 def test_a_ct_that_is_here_already_is_taken_as_if_pushed(tmp_path: Path, scans: dict[str, dict[str, Path]]) -> None:
@@ -414,7 +179,7 @@ def test_a_ct_that_is_here_already_is_taken_as_if_pushed(tmp_path: Path, scans: 
     nodule = tmp_path / "nodule.nii.gz"
     nodule.write_bytes(b"x")
     with scene.running(tmp_path / "cases", NoduleFiles(nodule, "A-1")) as node:
-        assert scene.push(node.port, scans["A-1"]["inflated"], scans["A-1"]["deflated"]) == 0
+        assert push(node.port, scans["A-1"]["inflated"], scans["A-1"]["deflated"]) == 0
         node.wait(lambda: len(node.results()) == 1)
     anonymous = write_series(tmp_path / "anonymous", scan(), Ids(patient=""))
     with pytest.raises(InputRefused, match="it states no PatientID; give another --ct"):

@@ -14,7 +14,7 @@ from tests.vatsloc import run_scene as known
 from vatsloc.imaging.surface import Border
 from vatsloc.workflow.gates import Gate
 from vatsloc.workflow.model_selection import Refinement
-from vatsloc.workflow.quality import in_view, quality_gates, surface_distances
+from vatsloc.workflow.quality import in_view, quality_gates, surface_distances, surface_percentiles
 from vatsloc.workflow.settings import GateSettings
 from vatsloc.workflow.stages import Stages
 
@@ -161,6 +161,7 @@ def test_where_no_air_is_seen_surface_gates_fail(scene: known.Scene) -> None:
     surface = scene.collapse.observed.surface
     bare = scene.with_observed(surface=surface.only(Border.CONTACT, Border.DENSE))
     assert_allclose(surface_distances(bare.collapse), [np.inf])
+    assert surface_percentiles(bare.collapse) == dict.fromkeys(("p50", "p75", "p90", "p95"), np.inf)
     gates = gates_of(bare, GateSettings())
     assert (gates["surface"].ok, gates["deflated_surface"].ok) == (False, False)
     assert gates["fissures"].value == 0

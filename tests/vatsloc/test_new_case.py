@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,14 +12,15 @@ import pytest
 
 from registration.volume import Volume
 from tests.vatsloc.imaging_thorax import CENTRES, cone_beam, thorax
-from vatsloc.case import Nodule as KnownNodule
-from vatsloc.case import read_case, told_side
+from vatsloc.case import read_case
 from vatsloc.cli import main
 from vatsloc.errors import CaseError, InputRefused
-from vatsloc.formats.markups import read_points
+from vatsloc.formats.markups import PointList, read_points, write_points
 from vatsloc.formats.nifti import write_volume
-from vatsloc.imaging.side import PleuralGas, nodule_side
+from vatsloc.imaging.side import PleuralGas, nodule_side, told_side
 from vatsloc.new_case import nodule_source
+from vatsloc.workflow.prepare import prepare
+from vatsloc.workflow.stages import Stages
 
 RADIUS = 110.0
 
@@ -154,10 +156,34 @@ def test_the_nodule_tells_the_side_else_the_gas_else_the_user_is_asked() -> None
     assert nodule_side(ct, None, CENTRES["left"]) == "left"
     between = np.array([0.0, 40.0, -10.0])
     assert nodule_side(ct, None, between) is None
-    nodule = KnownNodule(between, None)
-    assert told_side(ct, inflated, deflated, nodule) == ("right", "pleural gas")
+    told = told_side(ct, None, between, inflated, deflated)
+    assert (told.side, told.by) == ("right", "pleural gas")
     with pytest.raises(InputRefused, match=r'add side = "right" or side = "left" to case\.toml'):
-        told_side(ct, inflated, inflated, nodule)
+        told_side(ct, None, between, inflated, inflated)
+
+
+def test_scans_in_which_gas_tells_the_side_are_prepared_once(
+    images: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names = {"ct": "ct", "cbct_inflated": "inflated", "cbct_deflated": "deflated"}
+    toml = "[images]\n" + "".join(f'{name} = "{images[file]}"\n' for name, file in names.items())
+    (tmp_path / "case.toml").write_text(toml + '[nodule]\npoint = "nodule.mrk.json"\n')
+    write_points(tmp_path / "nodule.mrk.json", PointList(CENTRES["right"][None], ("nodule",), ("",)))
+    monkeypatch.setattr("vatsloc.imaging.side.nodule_side", lambda *_: None)
+    case = read_case(tmp_path)
+    stages = Stages()
+    expected = prepare(replace(case, seen=None), Stages())
+
+    def again(*_: object) -> None:
+        raise AssertionError("prepared a second time")
+
+    monkeypatch.setattr("vatsloc.workflow.prepare.prepare_cbct", again)
+    found = prepare(case, stages)
+    assert (case.side, case.side_told_by) == ("right", "pleural gas")
+    assert "pleural gas had to tell the side" in stages.skipped["CBCT preparation"]
+    for one, other in ((found.inflated, expected.inflated), (found.deflated, expected.deflated)):
+        np.testing.assert_array_equal(one.volume.hu, other.volume.hu)
+    assert found.gas == expected.gas
 
 
 @pytest.mark.parametrize(

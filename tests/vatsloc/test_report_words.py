@@ -14,7 +14,7 @@ ROOM = Path(vatsloc.report.__file__).parent
 UNITS = {"mm", "MB", "Pa", "vatsloc"}
 
 
-@pytest.mark.parametrize("name", ["report.html", "scores.html"])
+@pytest.mark.parametrize("name", ["page.html", "parts.html", "report.html", "scores.html", "forecast.html"])
 def test_templates_hold_no_words_of_their_own(name: str) -> None:
     text = (ROOM / name).read_text(encoding="utf-8")
     text = re.sub(r"<script.*?</script>|<style.*?</style>", "", text, flags=re.DOTALL)
@@ -32,7 +32,8 @@ def test_scripts_write_no_words_of_their_own(name: str) -> None:
 
 
 def test_every_word_is_used() -> None:
-    sources = [*ROOM.glob("*.py"), *ROOM.glob("*.html"), ROOM.parent / "workflow" / "run.py"]
+    workflow = ROOM.parent / "workflow"
+    sources = [*ROOM.glob("*.py"), *ROOM.glob("*.html"), workflow / "run.py", workflow / "foresee.py"]
     text = "\n".join(file.read_text(encoding="utf-8") for file in sources if file.name != "words.py")
     composed = {*(f"glance_trust_{level}" for level in ("ok", "warn", "fail")), "axial", "coronal", "sagittal"}
     composed |= {

@@ -37,16 +37,10 @@ def real_work(preset: str) -> Work:
 def gas_of(slices: Path) -> dict[str, float] | None:
     """Gas beside the lungs of a cone-beam CT, ml by side; None where its spine or its field of view is not found."""
     from vatsloc.formats.images import read_volume
-    from vatsloc.imaging.cbct import prepare_cbct
-    from vatsloc.imaging.side import gas_ml
-    from vatsloc.imaging.spine import segment_spine
+    from vatsloc.imaging.side import gas_ml, seen_in
 
     try:
-        prepared = prepare_cbct(read_volume(slices))
-        return {
-            str(side): ml
-            for side, ml in gas_ml(prepared, segment_spine(prepared.volume, prepared.field.usable)).items()
-        }
+        return {str(side): ml for side, ml in gas_ml(seen_in(read_volume(slices))).items()}
     except InputRefused:
         return None
 

@@ -5,7 +5,7 @@ CT shows pleural gas.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import ndimage
@@ -13,10 +13,10 @@ from scipy import ndimage
 from registration.images.morphology import dilate, erode
 from registration.volume import Array, Mask, Volume
 from vatsloc.errors import InputRefused
-from vatsloc.imaging.cbct import PreparedCbct
+from vatsloc.imaging.cbct import PreparedCbct, prepare_cbct
 from vatsloc.imaging.lattice import on_grid, working_copy
 from vatsloc.imaging.lungs import Side, lung_halves, nodule_voxels
-from vatsloc.imaging.spine import Spine
+from vatsloc.imaging.spine import Spine, segment_spine
 
 SPACING_MM = 3.0
 GAS_HU = -880.0
@@ -28,6 +28,30 @@ TIMES_BEFORE = 2.0
 """How much more gas than on the other side, and than before the collapse, tells the side."""
 MOST_OFF_MM = 15.0
 LEAST_NEARER_MM = 5.0
+
+
+class Seen(NamedTuple):
+    """A cone-beam CT fit for registration, and its spine."""
+
+    cbct: PreparedCbct
+    spine: Spine
+
+
+@dataclass(frozen=True)
+class SeenScans:
+    """Both cone-beam CTs. inflated: None where it was not taken."""
+
+    inflated: Seen | None
+    deflated: Seen
+
+
+@dataclass(frozen=True)
+class ToldSide:
+    """The operated side. by: "case.toml", "nodule" or "pleural gas"; seen: the cone-beam CTs where gas told it."""
+
+    side: Side
+    by: str
+    seen: SeenScans | None = None
 
 
 @dataclass(frozen=True)
@@ -64,10 +88,21 @@ class PleuralGas:
         }
 
 
-def pleural_gas(inflated: tuple[PreparedCbct, Spine] | None, deflated: tuple[PreparedCbct, Spine]) -> PleuralGas:
+def seen_in(image: Volume) -> Seen:
+    """A cone-beam CT as it comes, made fit for registration. Raises InputRefused where no field or spine is seen."""
+    cbct = prepare_cbct(image)
+    return Seen(cbct, segment_spine(cbct.volume, cbct.field.usable))
+
+
+def seen_scans(inflated: Volume | None, deflated: Volume) -> SeenScans:
+    """Both cone-beam CTs as they come, made fit for registration. Raises as `seen_in`."""
+    return SeenScans(None if inflated is None else seen_in(inflated), seen_in(deflated))
+
+
+def pleural_gas(scans: SeenScans) -> PleuralGas:
     """Gas beside the lungs before and after the collapse, parted by the spine; none before it without a scan."""
     none: dict[Side, float] = {"right": 0.0, "left": 0.0}
-    return PleuralGas(none if inflated is None else gas_ml(*inflated), gas_ml(*deflated))
+    return PleuralGas(none if scans.inflated is None else gas_ml(scans.inflated), gas_ml(scans.deflated))
 
 
 def nodule_side(ct: Volume, nodule: Mask | None, nodule_ras: Array | None) -> Side | None:
@@ -91,17 +126,38 @@ def nodule_side(ct: Volume, nodule: Mask | None, nodule_ras: Array | None) -> Si
     return nearest if clear else None
 
 
-def gas_ml(cbct: PreparedCbct, spine: Spine) -> dict[Side, float]:
+def told_side(
+    ct: Volume, nodule: Mask | None, nodule_ras: Array | None, inflated: Volume | None, deflated: Volume
+) -> ToldSide:
+    """What the lung that holds the nodule tells, else the pleural gas.
+
+    Raises InputRefused where neither does; `prepare` refuses a nodule and gas that contradict each other.
+    """
+    side = nodule_side(ct, nodule, nodule_ras)
+    if side is not None:
+        return ToldSide(side, "nodule")
+    seen = seen_scans(inflated, deflated)
+    side = pleural_gas(seen).side
+    if side is None:
+        raise InputRefused(
+            "Neither the nodule's place in the CT nor pleural gas in the deflated CBCT tells the operated side; "
+            'add side = "right" or side = "left" to case.toml.'
+        )
+    return ToldSide(side, "pleural gas", seen)
+
+
+def gas_ml(seen: Seen) -> dict[Side, float]:
     """Thick dark regions that no axial slice joins to the rim of the field of view, on either side of the spine."""
+    cbct, spine = seen
     work = working_copy(cbct.volume, SPACING_MM)
     spacing = work.grid.spacing
-    seen = on_grid(cbct.field.usable.inside, cbct.volume.grid, work.grid).inside
-    dark = (work.hu < GAS_HU) & seen
+    usable = on_grid(cbct.field.usable.inside, cbct.volume.grid, work.grid).inside
+    dark = (work.hu < GAS_HU) & usable
     dark &= dilate(erode(dark, THICK_MM / 2, spacing), THICK_MM / 2 + 0.5, spacing)
     in_slice = np.zeros((3, 3, 3), dtype=bool)
     in_slice[:, :, 1] = ndimage.generate_binary_structure(2, 1)
     labels, count = ndimage.label(dark, in_slice)
-    rim = dark & ~ndimage.binary_erosion(seen, np.ones((3, 3, 1), dtype=bool))
+    rim = dark & ~ndimage.binary_erosion(usable, np.ones((3, 3, 1), dtype=bool))
     outside = np.zeros(count + 1, dtype=bool)
     outside[np.unique(labels[rim])] = True
     outside[0] = True

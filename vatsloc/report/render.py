@@ -123,10 +123,11 @@ def write_report(path: Path, data: ReportData) -> None:
 def write_forecast(path: Path, name: str, told: Mapping[str, Any], picture: Picture, nodule: Nodule) -> None:
     """Write the page of a forecast (UTF-8). told: what foresee.json holds; picture: the CT with the lung."""
     page = _page("forecast.html").render(
+        level="warn",
+        verdict=WORDS["forecast_verdict"],
         name=name,
         told=told,
-        title=picture.title,
-        outlines=picture.outlines,
+        picture=picture,
         colour=NODULE,
         views=_views(picture, WINDOW_HU, nodule),
     )

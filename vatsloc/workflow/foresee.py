@@ -8,12 +8,14 @@ from typing import Any
 
 import numpy as np
 
+from registration.volume import Mask
 from vatsloc.case import CaseBefore, read_case_before
 from vatsloc.formats.folder import PROGRAM, whole_folder
 from vatsloc.formats.markups import PointList, write_points
 from vatsloc.frames import flip_points
 from vatsloc.report.data import LUNG, SURFACE, Nodule, Outline, Picture
 from vatsloc.report.render import write_forecast
+from vatsloc.report.words import WORDS
 from vatsloc.results import REPORT
 from vatsloc.workflow.forecast import Forecast, calibrated_motions, forecast
 from vatsloc.workflow.prepare import prepare_lungs
@@ -46,13 +48,8 @@ def foresee_case(folder: Path, out: Path, say: Say = quiet) -> dict[str, Any]:
         stages.warn(IS_FORECAST)
         told = _told(case, found, stages)
         with stages.stage("report"):
-            lung_line = Outline("operated lung in the CT", LUNG, lung)
-            picture = Picture("Where the nodule will probably be", "", case.ct, found.centre, (lung_line,))
-            if case.nodule.mask is not None:
-                lines = (lung_line, Outline("nodule in the CT", SURFACE, case.nodule.mask))
-                picture = Picture(picture.title, "", case.ct, found.centre, lines)
             nodule = Nodule(found.centre, found.axes * found.semi_axes_mm[:, None])
-            write_forecast(partial / REPORT, case.folder.resolve().name, told, picture, nodule)
+            write_forecast(partial / REPORT, case.folder.resolve().name, told, _picture(case, lung, found), nodule)
         write_points(partial / NODULE_FILE, PointList(found.centre[None], ("nodule",), ("forecast, not measured",)))
         (partial / FORECAST_FILE).write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
     return told
@@ -65,6 +62,15 @@ def is_forecast(folder: Path) -> bool:
     except (OSError, ValueError, RecursionError):
         return False
     return isinstance(told, dict) and told.get("program") == PROGRAM
+
+
+def _picture(case: CaseBefore, lung: Mask, found: Forecast) -> Picture:
+    """The CT with what has been seen so far outlined, through the forecast."""
+    lines = [Outline(WORDS["forecast_lung"], LUNG, lung)]
+    if case.nodule.mask is not None:
+        lines.append(Outline(WORDS["forecast_nodule"], SURFACE, case.nodule.mask))
+    title, says = WORDS["forecast_picture"], WORDS["forecast_picture_says"]
+    return Picture(title, says, case.ct, found.centre, tuple(lines))
 
 
 def _told(case: CaseBefore, found: Forecast, stages: Stages) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from vatsloc.case import Case, CaseBefore
 from vatsloc.imaging.cbct import PreparedCbct, prepare_cbct
 from vatsloc.imaging.lung_hint import operated_lung
 from vatsloc.imaging.lungs import Lungs, segment_lungs
-from vatsloc.imaging.side import PleuralGas, pleural_gas
+from vatsloc.imaging.side import PleuralGas, Seen, SeenScans, pleural_gas
 from vatsloc.imaging.spine import Spine, segment_spine
 from vatsloc.workflow.stages import CT, DEFLATED, INFLATED, Stages
 
@@ -50,13 +50,13 @@ def prepare(case: Case, stages: Stages, known: PreparedBefore | None = None) -> 
         if case.cbct_inflated is None:
             raise ValueError("the case has no inflated scan; give what stands in for it")
         known = prepare_before(case, case.cbct_inflated, stages)
-    deflated, spine = _cbct(case.cbct_deflated, DEFLATED, stages)
+    seen = _cbct(case.cbct_deflated, DEFLATED, stages, None if case.seen is None else case.seen.deflated)
     with stages.stage("spines", DEFLATED):
-        scanned = None if case.cbct_inflated is None else (known.inflated, known.spine_inflated)
-        gas = pleural_gas(scanned, (deflated, spine))
+        inflated = None if case.cbct_inflated is None else Seen(known.inflated, known.spine_inflated)
+        gas = pleural_gas(SeenScans(inflated, seen))
         gas.require(case.side, case.side_told_by)
     own = {f.name: getattr(known, f.name) for f in fields(PreparedBefore)}
-    return Prepared(**own, deflated=deflated, spine_deflated=spine, gas=gas)
+    return Prepared(**own, deflated=seen.cbct, spine_deflated=seen.spine, gas=gas)
 
 
 def prepare_before(
@@ -64,8 +64,8 @@ def prepare_before(
 ) -> PreparedBefore:
     """The part of `prepare` that needs no deflated scan."""
     ct = known or prepare_ct(case, stages)
-    inflated, spine = _cbct(cbct_inflated, INFLATED, stages)
-    return PreparedBefore(ct.lungs, ct.lung_ct, ct.spine_ct, inflated, spine)
+    seen = _cbct(cbct_inflated, INFLATED, stages, None if case.seen is None else case.seen.inflated)
+    return PreparedBefore(ct.lungs, ct.lung_ct, ct.spine_ct, seen.cbct, seen.spine)
 
 
 def prepare_ct(case: CaseBefore, stages: Stages) -> PreparedCt:
@@ -89,8 +89,12 @@ def prepare_lungs(case: CaseBefore, stages: Stages) -> Lungs:
     return lungs
 
 
-def _cbct(image: Volume, name: str, stages: Stages) -> tuple[PreparedCbct, Spine]:
+def _cbct(image: Volume, name: str, stages: Stages, seen: Seen | None) -> Seen:
+    """A cone-beam CT made fit for registration, once."""
+    if seen is not None:
+        stages.skip("CBCT preparation", "done while the scans were read, for pleural gas had to tell the side")
+        return seen
     with stages.stage("CBCT preparation", name):
         cbct = prepare_cbct(image)
     with stages.stage("spines", name):
-        return cbct, segment_spine(cbct.volume, cbct.field.usable)
+        return Seen(cbct, segment_spine(cbct.volume, cbct.field.usable))

@@ -19,6 +19,8 @@ from vatsloc.workflow.pose import ChangeOfPose
 from vatsloc.workflow.settings import GateSettings
 from vatsloc.workflow.stages import Stages
 
+PERCENTILES = {"p50": 50, "p75": 75, "p90": 90, "p95": 95}
+
 
 def quality_gates(pose: ChangeOfPose, collapse: Collapse, limits: GateSettings) -> dict[str, Gate]:
     """Every check of a run but the nodule's own, by name."""
@@ -97,6 +99,14 @@ def surface_distances(collapse: Collapse) -> Array:
     if len(points) == 0:
         return np.array([np.inf])
     return np.asarray(np.abs(closest_points(collapse.mesh_after.boundary, points).distance))
+
+
+def surface_percentiles(collapse: Collapse) -> dict[str, float]:
+    """Of those distances in mm, by name; infinite where no air border was seen."""
+    distances = surface_distances(collapse)
+    if not np.isfinite(distances).all():  # numpy interpolates between two infinite ones
+        return dict.fromkeys(PERCENTILES, np.inf)
+    return {name: float(np.percentile(distances, share)) for name, share in PERCENTILES.items()}
 
 
 def warn_of_doubts(pose: ChangeOfPose, collapse: Collapse, stages: Stages) -> None:

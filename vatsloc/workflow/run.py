@@ -41,7 +41,7 @@ from vatsloc.workflow.localization import Localization
 from vatsloc.workflow.localize import localize
 from vatsloc.workflow.pneumothorax import contact_surface
 from vatsloc.workflow.pose import ChangeOfPose
-from vatsloc.workflow.quality import surface_distances
+from vatsloc.workflow.quality import surface_percentiles
 from vatsloc.workflow.refinement import BlockRefinement
 from vatsloc.workflow.residual import Residual
 from vatsloc.workflow.settings import Settings
@@ -255,7 +255,7 @@ def _residuals(found: Localization) -> dict[str, Any]:
         "model_selection": [asdict(refinement) for refinement in collapse.model.refinements],
         "residual_registration": _corrected(collapse.residual),
         "block_refinement": {"inflated": _passes(pose.refinement), "deflated": _passes(collapse.refinement)},
-        "surface_mm": {f"p{share}": np.percentile(surface_distances(collapse), share) for share in (50, 75, 90, 95)},
+        "surface_mm": surface_percentiles(collapse),
         "mesh": {"tetrahedra": len(pose.mesh_ct.tets), "model_tetrahedra": len(collapse.system.mesh.tets)},
     }
 

@@ -88,12 +88,12 @@ def run_cohort(
 
 
 def progress(done: int, total: int, ran: int, seconds: float) -> str:
-    """A bar of what is done, and the time that the rest takes at the pace of the `ran` cases of this run."""
+    """A bar of what is done, and the time that the rest takes at the pace of the `ran` cases of this run; at the end
+    that pace."""
     filled = BAR * done // max(total, 1)
-    left = seconds / max(ran, 1) * (total - done) / 60
-    return f"[{'#' * filled}{'.' * (BAR - filled)}] {done}/{total}" + (
-        f", {left:.0f} min left;" if total > done else ";"
-    )
+    left, pace = seconds / max(ran, 1) * (total - done) / 60, 3600 * ran / max(seconds, 1e-3)
+    tells = f"{left:.0f} min left" if total > done else f"{pace:.0f} cases per hour"
+    return f"[{'#' * filled}{'.' * (BAR - filled)}] {done}/{total}, {tells};"
 
 
 def _outcome(finished: Future[Outcome], job: Job) -> Outcome:
