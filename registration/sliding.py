@@ -20,7 +20,7 @@ from registration.keypoints.matching import MatchSettings, match_keypoints
 from registration.maps.composite import dense_field
 from registration.maps.field import PointMap
 from registration.maps.rigid import RigidTransform
-from registration.volume import Cut, Mask, Volume
+from registration.volume import Array, Mask, Volume
 
 OUTSIDE_HU = -1100.0
 BEYOND_MM = 5.0
@@ -43,6 +43,26 @@ LEAST_MATCHES = 20
 
 
 @dataclass(frozen=True)
+class LungImage:
+    """An image and the lung in it. seen: the scanner's field of view, None for all of the image."""
+
+    volume: Volume
+    lung: Mask
+    seen: Mask | None = None
+
+    def near(self, margin_mm: float) -> LungImage:
+        """The slices about the lung."""
+        cut = bounding_box(self.lung.inside, np.ceil(margin_mm / self.lung.grid.spacing).astype(int))
+        seen = None if self.seen is None else self.seen.part(cut)
+        return LungImage(self.volume.part(cut), self.lung.part(cut), seen)
+
+    def seen_of(self, region: Array) -> Mask:
+        """What the scanner saw of a region given by voxels (ni, nj, nk)."""
+        inside = region if self.seen is None else region & self.seen.inside
+        return Mask(inside, self.volume.ras_from_ijk)
+
+
+@dataclass(frozen=True)
 class SlidingFit(FfdFit):
     """A free-form deformation, and how it began. matched: keypoints matched about the prior, 0 for too few; moved_mm:
     how far 95 % of them moved against it, infinite for too few; coarse: whether the coarse levels ran.
@@ -54,35 +74,26 @@ class SlidingFit(FfdFit):
 
 
 def register_sliding(
-    fixed: Volume,
-    moving: Volume,
-    moving_lung: Mask,
+    fixed: LungImage,
+    moving: LungImage,
     settings: FfdSettings,
-    *,
-    fixed_lung: Mask,
-    seen: Mask | None = None,
     prior: PointMap | None = None,
+    *,
     coarse_beyond_mm: float = -1.0,
     progress: Callable[[str, float], None] | None = None,
 ) -> SlidingFit:
     """Free-form deformation of a lung alone, whatever its wall does.
 
-    seen: field of view of the fixed image. Both images are set to -1100 HU outside their lungs and compared inside the
-    fixed lung dilated by 5 mm, so the wall is met and nothing outside can pull. A smooth wall looks alike wherever it
-    has slid to, and vessels look alike when the map starts far off, so keypoints inside the lung are matched first, up
-    to 24 mm off the prior, and lead the coarse levels, down to a control spacing of 32 mm; matched again under that
-    map, they hold the finest, and where there are many these bend more easily. coarse_beyond_mm: the coarse levels are
-    left out where 95 % of the keypoints moved by no more than that against the prior; those matches then hold the
-    finest.
+    prior: any map of points, fixed to moving (default identity). Both images are set to -1100 HU outside their
+    lungs and compared inside the fixed lung dilated by 5 mm, so the wall is met and nothing outside can pull. A
+    smooth wall looks alike wherever it has slid to, and vessels look alike when the map starts far off, so
+    keypoints inside the lung are matched first, up to 24 mm off the prior, and lead the coarse levels, down to a
+    control spacing of 32 mm; matched again under that map, they hold the finest, and where there are many these
+    bend more easily. coarse_beyond_mm: the coarse levels are left out where 95 % of the keypoints moved by no more
+    than that against the prior; those matches then hold the finest.
     """
-    cut = _around(fixed_lung, AROUND_MM)
-    fixed, fixed_lung = fixed.part(cut), fixed_lung.part(cut)
-    seen = Mask(np.ones_like(fixed_lung.inside), fixed_lung.ras_from_ijk) if seen is None else seen.part(cut)
-    cut = _around(moving_lung, AROUND_MM)
-    moving, moving_lung = moving.part(cut), moving_lung.part(cut)
-    region = Mask(dilate(fixed_lung.inside, BEYOND_MM, fixed_lung.grid.spacing) & seen.inside, fixed.ras_from_ijk)
-    inner = Mask(fixed_lung.inside & seen.inside, fixed.ras_from_ijk)
-    images = masked(fixed, fixed_lung), masked(moving, moving_lung)
+    fixed, moving = fixed.near(AROUND_MM), moving.near(AROUND_MM)
+    images = masked(fixed.volume, fixed.lung), masked(moving.volume, moving.lung)
     start = prior or RigidTransform.identity()
     finer = max(ceil(log2(LEADING_MM / settings.spacing_mm)), 1)
     coarse = replace(
@@ -92,8 +103,9 @@ def register_sliding(
         levels=max(settings.levels - finer, 1),
     )
     voxel = settings.voxel_mm
-    match = partial(_match, coarsen(fixed, voxel), coarsen(moving, voxel), inner, moving_lung, voxel)
-    register = partial(register_ffd, *images, fixed_mask=region, progress=progress)
+    inner = LungImage(coarsen(fixed.volume, voxel), fixed.seen_of(fixed.lung.inside))
+    match = partial(_match, inner, LungImage(coarsen(moving.volume, voxel), moving.lung), voxel)
+    register = partial(register_ffd, *images, fixed_mask=beyond_the_wall(fixed), progress=progress)
     first, matches = start, match(start, FAR_MM)
     matched, moved = 0 if matches is None else len(matches), moved_mm(matches, start)
     is_far = moved > coarse_beyond_mm
@@ -124,22 +136,20 @@ def moved_mm(matches: Correspondences | None, prior: PointMap) -> float:
 
 
 def _match(
-    fixed: Volume,
-    moving: Volume,
-    fixed_lung: Mask,
-    moving_lung: Mask,
-    voxel_mm: float,
-    prior: PointMap,
-    reach_mm: float,
+    fixed: LungImage, moving: LungImage, voxel_mm: float, prior: PointMap, reach_mm: float
 ) -> Correspondences | None:
-    """Keypoints inside both lungs, matched at most `reach_mm` from where `prior` puts them; None for too few."""
-    dense = dense_field(prior, fixed.grid)
+    """Keypoints inside both lungs, matched at most `reach_mm` from where `prior` puts them; None for too few.
+
+    Of either image the volume has voxels of `voxel_mm`; its lung's may be finer.
+    """
+    grid = fixed.volume.grid
+    dense = dense_field(prior, grid)
     matches = match_keypoints(
-        fixed,
-        resample(moving, fixed.grid, dense),
-        resample_mask(fixed_lung, fixed.grid),
+        fixed.volume,
+        resample(moving.volume, grid, dense),
+        resample_mask(fixed.lung, grid),
         MatchSettings(voxel_mm=voxel_mm, reach_mm=reach_mm),
-        moving_region=resample_mask(moving_lung, fixed.grid, dense),
+        moving_region=resample_mask(moving.lung, grid, dense),
     )
     return None if len(matches) < LEAST_MATCHES else matches.mapped(moving=prior)
 
@@ -152,6 +162,6 @@ def masked(volume: Volume, lung: Mask) -> Volume:
     return Volume(hu.astype(np.float32), volume.ras_from_ijk)
 
 
-def _around(lung: Mask, margin_mm: float) -> Cut:
-    """Slices about a lung."""
-    return bounding_box(lung.inside, np.ceil(margin_mm / lung.grid.spacing).astype(int))
+def beyond_the_wall(image: LungImage) -> Mask:
+    """What is compared: the lung dilated by 5 mm, so that its wall is met, as far as the scanner saw it."""
+    return image.seen_of(dilate(image.lung.inside, BEYOND_MM, image.lung.grid.spacing))

@@ -45,7 +45,8 @@ SCOPE: Scope = {
     "registration/**/*.py": (),
     "poro/**/*.py": (),
     "poro/contact/*.py": named("poro", "contact hertz"),
-    "poro/mesh/*.py": (*named("poro", "mesh mesh_masks contact fit"), *named("vatsloc", "shuffled_nodes breathing")),
+    "poro/mesh/*.py": named("poro", "mesh mesh_masks rasterize pieces contact fit")
+    + named("vatsloc", "shuffled_nodes"),
     "vatsloc/case.py": named("vatsloc", "case case_refused marks new_case greyvalues dicom_regions"),
     "vatsloc/frames.py": (),
     "vatsloc/maps.py": (),
@@ -169,7 +170,8 @@ def verdicts(found: Sequence[Mutant], judges: Scope, imports: Imports, asked: ar
     with tempfile.TemporaryDirectory(prefix="mutation-") as base:
         trees = [Path(base, str(job), "tree") for job in range(asked.jobs)]
         copy_tree(imports.root, trees[0], asked.out)
-        seconds = baseline(trees[0], sorted({test for tests in steps.values() for test in tests}), *without)
+        reached = sorted({test for tests in steps.values() for test in tests})
+        seconds = baseline(trees[0], reached, *without, log=asked.out / "seconds.json")
         for tree in trees[1:]:
             copy_tree(trees[0], tree, asked.out)
         records |= work_off([partial(by_tests, mutant) for mutant in waiting], trees, log)

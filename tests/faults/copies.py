@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shutil
@@ -20,7 +21,9 @@ from tests.faults.imports import LEFT_OUT
 from tests.faults.mutants import Mutant
 
 FAILED = re.compile(r"^(?:FAILED|ERROR) (\S+)", re.MULTILINE)
+FAILED_FILE = re.compile(r"^(?:FAILED|ERROR) ([^\s:]+)", re.MULTILINE)
 TIMES, COMPILING_S = 2.0, 60.0  # a mutant hangs that takes this many times as long and as many seconds for kernels
+RUN = (0, 1, 5)  # pytest's exit codes for all passed, some failed, and none left after --deselect
 NOT_RUN = (4, 5)  # pytest's exit codes for a wrong command line and for no tests
 
 
@@ -56,19 +59,25 @@ def run_tests(tree: Path, words: Sequence[str], timeout: float | None = None) ->
     return process.returncode, said
 
 
-def baseline(tree: Path, tests: Sequence[str], *words: str) -> dict[str, float]:
-    """Seconds of each test file without a fault, kernels being compiled on the way. Exits where a test fails."""
-    report = tree.parent / "baseline.xml"
-    if not tests:
-        return {}
-    code, said = run_tests(tree, [*tests, *words, f"--junitxml={report}"])
-    if code != 0:
-        raise SystemExit(f"The tests fail without a fault (pytest exits with {code}); mend them first.\n{said}")
-    seconds = dict.fromkeys(tests, 0.0)
-    for case in ElementTree.parse(report).iter("testcase"):
-        file = f"{case.attrib['classname'].replace('.', '/')}.py"
-        seconds[file] += float(case.attrib["time"])
-    return seconds
+def baseline(tree: Path, tests: Sequence[str], *words: str, log: Path | None = None) -> dict[str, float]:
+    """Seconds of each test file without a fault, kernels being compiled on the way. Exits where a test fails.
+
+    log: JSON file of the seconds of files that passed, which are not run again.
+    """
+    known: dict[str, float] = json.loads(log.read_text("utf-8")) if log is not None and log.exists() else {}
+    waiting = [test for test in tests if test not in known]
+    if waiting:
+        report = tree.parent / "baseline.xml"
+        code, said = run_tests(tree, [*waiting, *words, f"--junitxml={report}"])
+        seconds, failed = dict.fromkeys(waiting, 0.0), set(FAILED_FILE.findall(said))
+        for case in ElementTree.parse(report).iter("testcase") if code in RUN else ():
+            seconds[f"{case.attrib['classname'].replace('.', '/')}.py"] += float(case.attrib["time"])
+        known |= {test: took for test, took in seconds.items() if code in RUN and test not in failed}
+        if log is not None:
+            log.write_text(json.dumps(known, indent=1), encoding="utf-8")
+        if code not in (0, 5):
+            raise SystemExit(f"The tests fail without a fault (pytest exits with {code}); mend them first.\n{said}")
+    return {test: known[test] for test in tests}
 
 
 @contextmanager

@@ -16,7 +16,7 @@ from registration.images.morphology import dilate
 from registration.maps.bspline import BSplineField, control_grid
 from registration.maps.composite import CompositeTransform
 from registration.maps.rigid import RigidTransform
-from registration.sliding import finest_weights, masked, register_sliding
+from registration.sliding import LungImage, finest_weights, masked, register_sliding
 from registration.terms.gauss_newton import Stop
 from registration.volume import Array, Grid, Mask, Volume
 from tests.registration.scenes import image_of, make_pattern, oriented
@@ -136,8 +136,9 @@ def test_a_lung_slides_past_a_wall_that_stays() -> None:
     def tube(g: Grid) -> Mask:
         return Mask(np.hypot(*np.moveaxis(g.points() - CENTRE, 3, 0)[:2]) < radius, g.ras_from_ijk)
 
-    fit = register_sliding(fixed, moving, tube(WIDE), COARSE, fixed_lung=tube(grid))
-    led = register_sliding(fixed, moving, tube(WIDE), COARSE, fixed_lung=tube(grid), coarse_beyond_mm=14.0)
+    images = LungImage(fixed, tube(grid)), LungImage(moving, tube(WIDE))
+    fit = register_sliding(*images, COARSE)
+    led = register_sliding(*images, COARSE, coarse_beyond_mm=14.0)
     assert (fit.coarse, led.coarse) == (True, False)
     assert fit.matched == led.matched > 20
     assert fit.moved_mm == led.moved_mm == pytest.approx(np.linalg.norm(slide), abs=1.0)
@@ -169,8 +170,8 @@ def test_the_coarse_levels_run_where_matches_moved_far_or_are_too_few(
     monkeypatch.setattr(sliding, "match_keypoints", lambda *_values, **_named: matches)
     monkeypatch.setattr(sliding, "register_ffd", register)
     blank = Volume(np.full(GRID.shape, -700, np.float32), GRID.ras_from_ijk)
-    lung = Mask(np.linalg.norm(GRID.points() - CENTRE, axis=-1) < 20, GRID.ras_from_ijk)
-    fit = register_sliding(blank, blank, lung, COARSE, fixed_lung=lung, coarse_beyond_mm=limit)
+    image = LungImage(blank, Mask(np.linalg.norm(GRID.points() - CENTRE, axis=-1) < 20, GRID.ras_from_ijk))
+    fit = register_sliding(image, image, COARSE, coarse_beyond_mm=limit)
     assert fit.coarse is coarse
     assert len(asked) == 1 + coarse
     enough = count >= 20
@@ -213,7 +214,7 @@ def test_bare_tissue_follows_the_depth_and_not_a_tapering_wall() -> None:
     for seed in range(8, 12):
         vessels = make_pattern(seed)
         fixed, moving = image(grid, vessels, slide), image(wide, vessels, np.zeros(3))
-        fit = register_sliding(fixed, moving, cone(wide), settings, fixed_lung=cone(grid))
+        fit = register_sliding(LungImage(fixed, cone(grid)), LungImage(moving, cone(wide)), settings)
         held = register_ffd(masked(fixed, cone(grid)), masked(moving, cone(wide)), settings, fixed_mask=around)
         assert fit.folded_share == 0
         for f, off in ((fit, along), (held, before)):

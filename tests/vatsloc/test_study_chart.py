@@ -20,6 +20,7 @@ from poro.mesh import TetMesh
 from registration.ffd import FfdSettings, Weights
 from registration.images.resample import resample
 from registration.maps.rigid import RigidTransform
+from registration.sliding import LungImage
 from registration.volume import Mask, Volume
 from tests.vatsloc.browser import CHROMIUM, asked_by_the_page, visit
 from vatsloc.errors import CaseError, InputRefused
@@ -211,16 +212,13 @@ def pair(mapped: Any) -> tuple[Volume, Volume, Mask]:
     return resample(moving, grid, mapped), moving, Mask(np.ones(grid.shape, dtype=bool), affine)
 
 
-def given(mask: Mask) -> dict[str, Any]:
-    return {"fixed_lung": mask, "seen": mask, "prior": RigidTransform.identity()}
-
-
 def test_the_stiff_free_form_of_the_variant_affine_is_an_affine_map() -> None:
     matrix = np.array([[1.04, 0.02, 0], [0, 0.97, 0.01], [-0.02, 0, 1.02]])
     fixed, moving, mask = pair(lambda x: (x - 60) @ matrix.T + 60 + [2, -1, 3])
     stiff = VARIANTS["affine"].settings.registration
     settings = FfdSettings(stiff.grid_mm, stiff.levels, 4.0, None, weights=Weights(bending=stiff.bending))
-    found = plain(fixed, moving, mask, settings, **given(mask)).moving_from_fixed
+    images = LungImage(fixed, mask, mask), LungImage(moving, mask)
+    found = plain(*images, settings, RigidTransform.identity()).moving_from_fixed
     points = np.random.default_rng(3).uniform(20, 96, (200, 3))
     affine = affine_to_points(points, found(points))
     assert np.abs(affine(points) - found(points)).max() < 0.05
@@ -236,8 +234,8 @@ def test_variants_of_the_registration_find_a_shift_by_value_and_sign(register: A
     points, affine = fixed.grid.points(), fixed.ras_from_ijk
     fixed_lung = Mask(np.linalg.norm(points + shift - 60, axis=-1) < 40, affine)
     moving_lung = Mask(np.linalg.norm(points - 60, axis=-1) < 40, affine)
-    asked = given(fixed_lung) | {"seen": seen}
-    fit = register(fixed, moving, moving_lung, FfdSettings(24.0, 2, 4.0, None), **asked)
+    images = LungImage(fixed, fixed_lung, seen), LungImage(moving, moving_lung)
+    fit = register(*images, FfdSettings(24.0, 2, 4.0, None), RigidTransform.identity())
     middle = np.array([[60.0, 60, 60]])
     np.testing.assert_allclose(fit.moving_from_fixed(middle) - middle, [shift], atol=0.3)
 

@@ -17,7 +17,7 @@ from poro.mesh import TetMesh
 from registration.ffd import FfdSettings, Weights
 from registration.images.resample import resample_mask
 from registration.maps.rigid import RigidTransform
-from registration.sliding import register_sliding
+from registration.sliding import LungImage, register_sliding
 from registration.volume import Mask, Volume
 from vatsloc.breathing.case import BreathCase
 from vatsloc.breathing.lungs import Pair, both_scans
@@ -64,12 +64,10 @@ def by_registration(inspired: Volume, expired: Volume, pair: Pair, guess: Array)
     prior = MeshMap(mesh, guess, RigidTransform.identity())
     far = float(np.linalg.norm(guess - mesh.points, axis=1).mean()) > FAR_MM
     fit = register_sliding(
-        inspired,
-        expired,
-        _on(pair.expired, expired),
+        LungImage(inspired, _on(pair.inspired, inspired)),
+        LungImage(expired, _on(pair.expired, expired)),
         FfdSettings(spacing_mm=8.0, levels=4, voxel_mm=2.0, window_mm=14.0, weights=Weights()),
-        fixed_lung=_on(pair.inspired, inspired),
-        prior=prior if far else None,
+        prior if far else None,
     )
     points = fit.moving_from_fixed(mesh.points)
     whole = np.ones(len(points), bool)

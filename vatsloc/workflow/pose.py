@@ -15,7 +15,7 @@ from registration.ffd import FfdFit, FfdSettings, Weights
 from registration.images.resample import coarsen_mask
 from registration.maps.inversion import Inversion, invert_at
 from registration.maps.rigid import RigidTransform
-from registration.sliding import SlidingFit, register_sliding
+from registration.sliding import LungImage, SlidingFit, register_sliding
 from registration.spine import RigidFit, SpineSearch, register_spine
 from registration.volume import Array, Mask
 from vatsloc.case import CaseBefore
@@ -118,13 +118,10 @@ def change_of_pose(
         return ChangeOfPose(rigid, None, lung_inf, mesh, placed.points, nowhere, None, None, overlap, None)
     with stages.stage("free-form deformation"):
         ffd = register(
-            prepared.inflated.volume,
-            case.ct,
-            prepared.lung_ct,
+            LungImage(prepared.inflated.volume, lung_inf, prepared.inflated.field.usable),
+            LungImage(case.ct, prepared.lung_ct),
             ffd_settings(settings.registration),
-            fixed_lung=lung_inf,
-            seen=prepared.inflated.field.usable,
-            prior=ct_from_inf_rigid,
+            ct_from_inf_rigid,
             coarse_beyond_mm=settings.leave_out.first_registration_mm,
             progress=lambda what, _share: stages.say(what),
         )

@@ -9,7 +9,7 @@ import numpy as np
 
 from registration.images.resample import coarsen, resample, resample_mask
 from registration.maps.rigid import RigidTransform
-from registration.sliding import register_sliding
+from registration.sliding import LungImage, register_sliding
 from registration.volume import Array, Mask, Volume
 from vatsloc.study.bench.isolated import isolated
 from vatsloc.workflow.pose import ffd_settings
@@ -76,13 +76,10 @@ def _registered(images: Images, voxel_mm: float) -> dict[str, Any]:
         pass
     with stages.stage("registration"):
         register_sliding(
-            fixed,
-            moving,
-            moving_lung,
+            LungImage(fixed, lung, usable),
+            LungImage(moving, moving_lung),
             settings,
-            fixed_lung=lung,
-            seen=usable,
-            prior=images.pose,
+            images.pose,
         )
     return {
         "voxel_mm": voxel_mm,

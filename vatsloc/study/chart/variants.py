@@ -9,14 +9,13 @@ from math import inf
 from typing import Any, cast
 
 from registration.ffd import FfdFit, FfdSettings, register_ffd
-from registration.images.morphology import dilate
 from registration.images.resample import coarsen, resample_mask
 from registration.maps.composite import CompositeTransform
 from registration.maps.field import PointMap, compose
 from registration.maps.rigid import RigidTransform
-from registration.sliding import BEYOND_MM, masked, register_sliding
+from registration.sliding import LungImage, beyond_the_wall, masked, register_sliding
 from registration.terms.gauss_newton import Stop
-from registration.volume import Mask, Volume
+from registration.volume import Volume
 from vatsloc.errors import CaseError
 from vatsloc.study.bench.elastix import ElastixSettings, run_elastix
 from vatsloc.workflow.pose import Register
@@ -59,32 +58,29 @@ class Variant:
         return settings_of(self.preset, self.over)
 
 
-def plain(fixed: Volume, moving: Volume, _lung: Mask, settings: FfdSettings, **given: Any) -> FfdFit:
+def plain(fixed: LungImage, moving: LungImage, settings: FfdSettings, prior: PointMap, **_given: Any) -> FfdFit:
     """Free-form deformation of all that is seen."""
-    return register_ffd(fixed, moving, settings, fixed_mask=given["seen"], prior=given["prior"])
+    return register_ffd(fixed.volume, moving.volume, settings, fixed_mask=fixed.seen, prior=prior)
 
 
-def masked_only(fixed: Volume, moving: Volume, moving_lung: Mask, settings: FfdSettings, **given: Any) -> FfdFit:
+def masked_only(fixed: LungImage, moving: LungImage, settings: FfdSettings, prior: PointMap, **_given: Any) -> FfdFit:
     """The paper's: both images masked outside their lungs, compared 5 mm beyond. Ref: Alvarez 2021, section 6.1.4."""
-    lung: Mask = given["fixed_lung"]
-    near = dilate(lung.inside, BEYOND_MM, lung.grid.spacing)
     return register_ffd(
-        masked(fixed, lung),
-        masked(moving, moving_lung),
+        masked(fixed.volume, fixed.lung),
+        masked(moving.volume, moving.lung),
         settings,
-        fixed_mask=Mask(near & given["seen"].inside, lung.ras_from_ijk),
-        prior=given["prior"],
+        fixed_mask=beyond_the_wall(fixed),
+        prior=prior,
     )
 
 
-def elastix(fixed: Volume, moving: Volume, _lung: Mask, settings: FfdSettings, **given: Any) -> FfdFit:
+def elastix(fixed: LungImage, moving: LungImage, settings: FfdSettings, prior: RigidTransform, **_given: Any) -> FfdFit:
     """itk-elastix inside the lung mask, from the rigid pose, on voxels of 1.5 mm; its folding is not counted here."""
-    pose: RigidTransform = given["prior"]
-    lung = Mask(given["fixed_lung"].inside & given["seen"].inside, given["seen"].ras_from_ijk)
-    fixed, moving = coarsen(fixed, PEER_VOXEL_MM), coarsen(moving, PEER_VOXEL_MM)
-    moving = Volume(moving.hu, pose.inverse().matrix @ moving.ras_from_ijk)
-    run = run_elastix(fixed, moving, resample_mask(lung, fixed.grid), ElastixSettings(grid_mm=settings.spacing_mm))
-    found: PointMap = compose(pose, run.moving_from_fixed)
+    image, other = coarsen(fixed.volume, PEER_VOXEL_MM), coarsen(moving.volume, PEER_VOXEL_MM)
+    other = Volume(other.hu, prior.inverse().matrix @ other.ras_from_ijk)
+    lung = resample_mask(fixed.seen_of(fixed.lung.inside), image.grid)
+    run = run_elastix(image, other, lung, ElastixSettings(grid_mm=settings.spacing_mm))
+    found: PointMap = compose(prior, run.moving_from_fixed)
     return FfdFit(cast(CompositeTransform, found), Stop.ITERATIONS, (), float("nan"), 0.0, 1.0)
 
 

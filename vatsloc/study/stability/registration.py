@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 from registration.ffd import FfdFit, FfdSettings
 from registration.maps.field import PointMap
 from registration.maps.rigid import RigidTransform
-from registration.sliding import register_sliding
+from registration.sliding import LungImage, register_sliding
 from registration.spine import register_spine
 from registration.volume import Array, Grid, Mask, Volume
 from vatsloc.study.chart import variants as chart_variants
@@ -58,13 +58,10 @@ AXES: dict[str, tuple[float, ...]] = {
 
 @dataclass(frozen=True)
 class Pair:
-    """Images, lungs, what is seen, the start, and the truth at probes (n, 3) in the fixed image's lung and view."""
+    """Images, the start, and the truth at probes (n, 3) in the fixed image's lung and view."""
 
-    fixed: Volume
-    moving: Volume
-    fixed_lung: Mask
-    moving_lung: Mask
-    seen: Mask
+    fixed: LungImage
+    moving: LungImage
     start: PointMap
     probes: Array
     truth: Array
@@ -98,13 +95,9 @@ def make_pair(scene: Scene, seed: int) -> Pair:
     off *= scene.off_mm / np.linalg.norm(off)
     probes = points[seen & (_depth(mapped(points)) > 3.0)]
     probes = probes[rng.permutation(len(probes))[:1000]]
-    affine = grid.ras_from_ijk
     return Pair(
-        _volume(fixed, grid),
-        _volume(moving, grid),
-        Mask(inside.reshape(grid.shape), affine),
-        Mask((_depth(points) > 0).reshape(grid.shape), affine),
-        Mask(seen.reshape(grid.shape), affine),
+        LungImage(_volume(fixed, grid), _mask(inside, grid), _mask(seen, grid)),
+        LungImage(_volume(moving, grid), _mask(_depth(points) > 0, grid)),
         RigidTransform.about(np.zeros(3), np.zeros(3), off),
         probes,
         mapped(probes),
@@ -127,8 +120,7 @@ def ours(pair: Pair) -> FfdFit:
 
 
 def _registered(register: Register, pair: Pair) -> FfdFit:
-    given = {"fixed_lung": pair.fixed_lung, "seen": pair.seen, "prior": pair.start}
-    return register(pair.fixed, pair.moving, pair.moving_lung, SETTINGS, **given)
+    return register(pair.fixed, pair.moving, SETTINGS, pair.start)
 
 
 METHODS: dict[str, Callable[[Pair], FfdFit]] = {"plain": plain, "masked": masked_only, "ours": ours}
@@ -293,6 +285,10 @@ def _centred(shape: tuple[int, int, int], voxel_mm: float, centre: Array) -> Arr
 
 def _grid(voxel_mm: float, shape: tuple[int, int, int]) -> Grid:
     return Grid(shape, _centred(shape, voxel_mm, np.zeros(3)))
+
+
+def _mask(inside: Array, grid: Grid) -> Mask:
+    return Mask(inside.reshape(grid.shape), grid.ras_from_ijk)
 
 
 def _volume(hu: Array, grid: Grid) -> Volume:
