@@ -8,7 +8,7 @@ import traceback
 from contextlib import suppress
 from pathlib import Path
 from threading import Event
-from typing import Annotated, Literal
+from typing import Annotated
 
 import typer
 
@@ -19,8 +19,8 @@ os.environ["OPENBLAS_NUM_THREADS"] = "1"
 from vatsloc.errors import GateFailed, as_ours
 from vatsloc.listen_command import listen
 from vatsloc.phantom_command import phantom
-from vatsloc.study.commands import bench, stability
-from vatsloc.terminal import JsonOption, LinkOption, link, progress, say, show, show_line
+from vatsloc.study.commands import bench, calibrate_forecast, chart, cohort, paper, stability
+from vatsloc.terminal import JsonOption, LinkOption, PresetOption, SettingsOption, link, progress, say, show, show_line
 
 app = typer.Typer(
     add_completion=False,
@@ -30,7 +30,7 @@ app = typer.Typer(
 
 app.add_typer(bench, name="bench")
 app.add_typer(stability, name="stability")
-app.command()(phantom)
+app.add_typer(phantom, name="phantom")
 app.command()(listen)
 
 DEBUG = "--debug"
@@ -49,8 +49,8 @@ def _whole_program(
 def localize(
     case: CaseArgument,
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Results folder, written whole or not at all.")],
-    preset: Annotated[str, typer.Option(metavar="NAME", help="fast, balanced, accurate or auto.")] = "balanced",
-    settings: Annotated[Path | None, typer.Option(metavar="FILE", help="TOML file that overrides the preset.")] = None,
+    preset: PresetOption = "balanced",
+    settings: SettingsOption = None,
     state: Annotated[Path | None, typer.Option(metavar="STATE", help="What `vatsloc prepare` made of CASE.")] = None,
     openigtlink: LinkOption = None,
     as_json: JsonOption = False,
@@ -85,8 +85,8 @@ def localize(
 def prepare(
     case: CaseArgument,
     out: Annotated[Path, typer.Option("--out", metavar="STATE", help="Folder for `localize --state` to go on from.")],
-    preset: Annotated[str, typer.Option(metavar="NAME", help="fast, balanced, accurate or auto.")] = "balanced",
-    settings: Annotated[Path | None, typer.Option(metavar="FILE", help="TOML file that overrides the preset.")] = None,
+    preset: PresetOption = "balanced",
+    settings: SettingsOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Do all that needs no deflated scan: after the CT alone, and again once the inflated scan is there."""
@@ -119,18 +119,6 @@ def foresee(
             f"forecast: nodule at LPS {x:.0f} {y:.0f} {z:.0f} mm in the CT's frame, give or take {a:.0f}, {b:.0f}, "
             f"{c:.0f} mm (95 %); report: {out / 'report.html'}"
         )
-
-
-@app.command("calibrate-forecast")
-def calibrate_forecast(
-    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="JSON file of the persons; a rerun goes on.")],
-    persons: Annotated[int, typer.Option(metavar="N", min=5, help="Phantoms that are moved.")] = 36,
-) -> None:
-    """Move phantoms by their physics, and write what `foresee` forecasts from."""
-    from vatsloc.study.forecast import calibrate
-
-    calibrate(out, persons, say)
-    print(out)
 
 
 @app.command()
@@ -214,33 +202,6 @@ def export_dicom(
 
 
 @app.command()
-def cohort(
-    folders: Annotated[
-        list[Path], typer.Argument(metavar="DIR...", help="Case folders, or folders that hold case folders.")
-    ],
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for results and tables; a rerun goes on.")],
-    preset: Annotated[str, typer.Option(metavar="NAME", help="fast, balanced, accurate or auto.")] = "balanced",
-    settings: Annotated[Path | None, typer.Option(metavar="FILE", help="TOML file that overrides the preset.")] = None,
-    jobs: Annotated[int, typer.Option(metavar="N", min=1, help="Cases run at once.")] = 1,
-    scheduler: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="Dask scheduler whose workers see the same files.")
-    ] = None,
-    as_json: JsonOption = False,
-) -> None:
-    """Localize and score many cases; one table of errors, gates, seconds and memory as CSV, Markdown and HTML."""
-    from vatsloc.study.cohort.cohort import as_json as cohort_json
-    from vatsloc.study.cohort.cohort import find_cases, run_cohort, table
-    from vatsloc.workflow.settings import load_settings
-
-    load_settings(preset, settings)
-    outcomes = run_cohort(find_cases(folders), out, preset, settings, jobs, scheduler, say=say)
-    if as_json:
-        show(cohort_json(outcomes))
-    else:
-        print(table(outcomes))
-
-
-@app.command()
 def demo(
     out: Annotated[
         Path, typer.Option("--out", metavar="DIR", help="Folder for the phantom case and its result.")
@@ -263,43 +224,8 @@ def demo(
         raise GateFailed(f"The demo's quality gates failed: {', '.join(failed)}.")
 
 
-@app.command()
-def chart(
-    cases: Annotated[list[Path], typer.Argument(metavar="CASES...", help="Case folders with landmarks.")],
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for runs.csv and the chart.")],
-    variants: Annotated[str | None, typer.Option(metavar="A,B,..", help="Variants to run; all by default.")] = None,
-    clock: Annotated[
-        Literal["seconds", "cpu"], typer.Option(help="What is drawn: the clock's seconds or the processors'.")
-    ] = "seconds",
-) -> None:
-    """Errors against seconds of the method's variants over CASES; goes on where it was stopped (extra "report")."""
-    from vatsloc.study.chart.chart import run_chart
-    from vatsloc.study.chart.draw import require_matplotlib, write_chart
-    from vatsloc.study.chart.variants import VARIANTS, chosen_variants
-
-    require_matplotlib()
-    chosen = chosen_variants([name.strip() for name in variants.split(",")] if variants else None)
-    write_chart(run_chart(cases, chosen, out, say), VARIANTS, out, clock)
-    print(out / "chart.html")
-
-
-@app.command()
-def paper(
-    folders: Annotated[
-        list[Path], typer.Argument(metavar="DIR...", help="Case folders with landmarks, or folders that hold them.")
-    ],
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for errors and tables; a rerun goes on.")],
-    jobs: Annotated[int, typer.Option(metavar="N", min=1, help="Cases run at once.")] = 1,
-) -> None:
-    """The experiments of Alvarez 2021 on cases with truth: variants A to C, diaphragm, parameters (extra "report")."""
-    from vatsloc.study.chart.draw import require_matplotlib
-    from vatsloc.study.cohort.cohort import find_cases
-    from vatsloc.study.paper.draw import write_paper
-    from vatsloc.study.paper.paper import run_paper
-
-    require_matplotlib()
-    write_paper(run_paper(find_cases(folders), out, jobs, say), out)
-    print(out / "paper.md")
+for command in (cohort, chart, paper, calibrate_forecast):
+    app.command()(command)
 
 
 def _until_interrupted(sentence: str) -> None:

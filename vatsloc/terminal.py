@@ -15,6 +15,8 @@ import typer
 Options = TypeVar("Options")
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout.")]
+PresetOption = Annotated[str, typer.Option(metavar="NAME", help="fast, balanced, accurate or auto.")]
+SettingsOption = Annotated[Path | None, typer.Option(metavar="FILE", help="TOML file that overrides the preset.")]
 LinkOption = Annotated[
     int | None,
     typer.Option(metavar="PORT", min=1, max=65535, help='Serve the answer by OpenIGTLink (extra "navigation").'),

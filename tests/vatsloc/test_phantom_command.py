@@ -2,96 +2,143 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from vatsloc import phantom_command
+from vatsloc import synthetic
 from vatsloc.cli import main
 from vatsloc.errors import CaseError
-from vatsloc.phantom_command import MODES, make_suite, mode_of
+from vatsloc.phantom_command import phantom, subcommand_of
+from vatsloc.study.cohort import contact_sheet, suite
+from vatsloc.synthetic import case, series
+from vatsloc.terminal import say
 
-CASE = {"name": "demo", "out": Path("c"), "seed": 0, "cbct": "image"}
-SUITE = {"suite": Path("d"), "jobs": 1, "sheet": None, "beside": None, "cbct": "image"}
-TWIN = {"from_ct": Path("f"), "side": "right", "out": Path("c"), "name": None, "seed": 0, "nodule": None} | {
-    "cbct": "image"
-}
-BREATH = {"from_ct": Path("f"), "side": "right", "out": Path("d"), "series": 20, "seed": 0}
+CASE = ("write_phantom", "demo", Path("c"), 0, say, "image")
+SUITE = ("write_suite", Path("d"), 1, say, "image")
+
+
+def twin(side: str = "right", name: str | None = None, nodule: Path | None = None, cbct: str = "image") -> Any:
+    return ("write_twin", Path("f"), side, Path("c"), name, 0, nodule, say, cbct)
+
+
+def run(capsys: pytest.CaptureFixture[str], words: str) -> tuple[Any, str, str]:
+    with pytest.raises(SystemExit) as end:
+        main(["phantom", *words.split()])
+    return end.value.code, *capsys.readouterr()
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """What the command asks of those that write cases: the name of the function and what it was given."""
+    found: list[Any] = []
+
+    def watch(room: Any, name: str, answer: Any = None) -> None:
+        def ask(*values: Any, **named: Any) -> Any:
+            found.append((name, *values, *named.items()))
+            return answer
+
+        monkeypatch.setattr(room, name, ask)
+
+    watch(synthetic, "write_phantom")
+    watch(case, "write_twin")
+    watch(series, "write_series")
+    watch(suite, "write_suite", ["a", "b"])
+    watch(contact_sheet, "write_sheet")
+    monkeypatch.setattr(suite, "table", lambda made: f"table of {made}")
+    return found
 
 
 @pytest.mark.parametrize(
     ("words", "made"),
     [
         ("demo --out c", CASE),
-        ("demo --out c --seed 3 --cbct projection", CASE | {"seed": 3, "cbct": "projection"}),
-        ("--suite d", SUITE),
+        ("case demo --out c", CASE),
+        ("--out c demo", CASE),
+        ("demo --out c --seed 3 --cbct projection", (*CASE[:3], 3, say, "projection")),
+        ("--from-ct f --side right --out c", twin()),
+        ("--from-ct=f --out=c", twin()),
+        ("twin --from-ct f --out c --cbct projection", twin(cbct="projection")),
+        ("base --from-ct f --side left --out c --nodule n --seed 0", twin("left", "base", Path("n"))),
+        ("--from-ct f --series 20 --out c", ("write_series", Path("f"), "right", Path("c"), 20, 0, say)),
         (
-            "--suite d --jobs 2 --sheet s.png --beside b",
-            SUITE | {"jobs": 2, "sheet": Path("s.png"), "beside": Path("b")},
+            "--from-ct f --series 10 --out c --side left --seed 2",
+            ("write_series", Path("f"), "left", Path("c"), 10, 2, say),
         ),
-        ("--from-ct f --side right --out c", TWIN),
-        (
-            "base --from-ct f --side left --out c --nodule n --seed 0",
-            TWIN | {"side": "left", "name": "base"} | {"nodule": Path("n")},
-        ),
-        ("--from-ct f --series 20 --out d", BREATH),
-        ("--from-ct f --series 10 --out d --side left --seed 2", BREATH | {"series": 10, "side": "left", "seed": 2}),
     ],
 )
 def test_each_use_gets_what_was_said_and_its_defaults(
-    words: str, made: dict[str, Any], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    words: str, made: tuple[Any, ...], asked: list[Any], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    asked: list[dict[str, Any]] = []
-
-    def make(**values: Any) -> str:
-        asked.append(values)
-        return "made"
-
-    for key, mode in MODES.items():
-        monkeypatch.setitem(phantom_command.MODES, key, replace(mode, make=make))
-    with pytest.raises(SystemExit) as end:
-        main(["phantom", *words.split()])
-    assert end.value.code == 0
+    code, out, _ = run(capsys, words)
+    assert code == 0
     assert asked == [made]
-    assert capsys.readouterr().out == "made\n"
+    assert out == "c\n"
+
+
+@pytest.mark.parametrize("words", ["--suite d", "suite --suite d", "--suite d --jobs 1"])
+def test_the_suite_is_written_and_its_table_printed(
+    words: str, asked: list[Any], capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, out, _ = run(capsys, words)
+    assert (code, asked, out) == (0, [SUITE], "table of ['a', 'b']\n")
+
+
+def test_the_suite_s_sheet_shows_its_cases_beside_another(asked: list[Any], capsys: pytest.CaptureFixture[str]) -> None:
+    code, _, _ = run(capsys, "--suite d --jobs 2 --cbct projection --sheet s.png --beside b")
+    sheet = ("write_sheet", [Path("d/a"), Path("d/b")], Path("s.png"), ("beside", Path("b")))
+    assert code == 0
+    assert asked == [("write_suite", Path("d"), 2, say, "projection"), sheet]
 
 
 @pytest.mark.parametrize(
-    ("words", "sentence"),
+    ("words", "use", "sentence"),
     [
-        ("", "phantom NAME --out CASE: NAME, --out is missing"),
-        ("demo", "--out is missing"),
-        ("demo --out c --jobs 2", "--jobs does not belong there"),
-        ("demo --out c --side right", "--side does not belong there"),
-        ("--suite d --seed 0", "phantom --suite DIR: --seed does not belong there"),
-        ("--suite d --from-ct f --out c", "--from-ct, --out does not belong there"),
-        ("--suite d demo", "NAME does not belong there"),
-        ("--from-ct f", "--out is missing"),
-        ("--from-ct f --out c --sheet s", "--sheet does not belong there"),
-        ("--from-ct f --out c --series 20 --nodule n", "--nodule does not belong there"),
-        ("--series 20 --out c", "--from-ct is missing"),
+        ("demo", "case", "Missing option '--out'"),
+        ("--out c", "case", "Missing argument 'NAME'"),
+        ("demo --out c --jobs 2", "case", "No such option: --jobs"),
+        ("demo --out c --side right", "case", "No such option: --side"),
+        ("--suite d --seed 0", "suite", "No such option: --seed"),
+        ("--suite d --jobs 0", "suite", "Invalid value for '--jobs'"),
+        ("--suite d --from-ct f --out c", "suite", "No such option: --from-ct"),
+        ("--suite d demo", "suite", "unexpected extra argument"),
+        ("--from-ct f", "twin", "Missing option '--out'"),
+        ("--from-ct f --out c --sheet s", "twin", "No such option: --sheet"),
+        ("--from-ct f --out c --series 20 --nodule n", "breath", "No such option: --nodule"),
+        ("--from-ct f --out c --series 9", "breath", "Invalid value for '--series'"),
+        ("--series 20 --out c", "breath", "Missing option '--from-ct'"),
     ],
 )
 def test_what_lacks_or_belongs_to_another_use_is_named(
-    words: str, sentence: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    words: str, use: str, sentence: str, asked: list[Any], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(SystemExit) as end:
-        main(["phantom", *words.split()])
-    assert end.value.code == CaseError.exit_code
-    assert sentence in capsys.readouterr().err
-    assert list(tmp_path.iterdir()) == []
+    code, _, said = run(capsys, words)
+    assert code == CaseError.exit_code
+    assert f"phantom {use}" in said
+    assert sentence in said
+    assert asked == []
 
 
-def test_a_mode_s_sentence_lists_every_use() -> None:
-    with pytest.raises(CaseError) as refusal:
-        mode_of({"jobs"})
-    assert all(f"phantom {mode.usage}" in str(refusal.value) for mode in MODES.values())
+def test_a_side_that_is_none_is_refused(asked: list[Any], capsys: pytest.CaptureFixture[str]) -> None:
+    code, _, said = run(capsys, "--from-ct f --out c --side middle")
+    assert code == CaseError.exit_code
+    assert 'got "middle"' in said
+    assert asked == []
 
 
-def test_a_case_beside_the_sheet_needs_the_sheet(tmp_path: Path) -> None:
-    with pytest.raises(CaseError, match="give --sheet FILE too"):
-        make_suite(tmp_path / "suite", 1, None, tmp_path, "image")
-    assert list(tmp_path.iterdir()) == []
+@pytest.mark.parametrize("words", ["", "--help"])
+def test_the_help_lists_every_use(words: str, capsys: pytest.CaptureFixture[str]) -> None:
+    code, out, _ = run(capsys, words)
+    assert code == (0 if words else CaseError.exit_code)
+    uses = [command.name for command in phantom.registered_commands]
+    assert all(f" {use} " in out for use in uses)
+    assert uses == ["case", "suite", "twin", "breath"]
+    assert {subcommand_of(line) for line in (["x"], ["--suite"], ["--from-ct"], ["--series=1"])} == set(uses)
+
+
+def test_a_case_beside_the_sheet_needs_the_sheet(asked: list[Any], capsys: pytest.CaptureFixture[str]) -> None:
+    code, _, said = run(capsys, "--suite d --beside b")
+    assert code == CaseError.exit_code
+    assert "give --sheet FILE too" in said
+    assert asked == []

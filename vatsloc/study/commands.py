@@ -1,14 +1,14 @@
-"""Commands `vatsloc bench` and `vatsloc stability`."""
+"""Commands that study the method: `bench`, `stability`, `cohort`, `chart`, `paper` and `calibrate-forecast`."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
-from vatsloc.terminal import JsonOption, say, show
+from vatsloc.terminal import JsonOption, PresetOption, SettingsOption, say, show
 
 bench = typer.Typer(no_args_is_help=True, help="Measure a part of the product, beside other programs where installed.")
 stability = typer.Typer(no_args_is_help=True, help="Show where a part of the product stops being right.")
@@ -210,3 +210,77 @@ def stability_choices_command(
     from vatsloc.study.stability.choices import study_choices, table
 
     print(table(study_choices(cases, out, say=say)))
+
+
+def calibrate_forecast(
+    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="JSON file of the persons; a rerun goes on.")],
+    persons: Annotated[int, typer.Option(metavar="N", min=5, help="Phantoms that are moved.")] = 36,
+) -> None:
+    """Move phantoms by their physics, and write what `foresee` forecasts from."""
+    from vatsloc.study.forecast import calibrate
+
+    calibrate(out, persons, say)
+    print(out)
+
+
+def cohort(
+    folders: Annotated[
+        list[Path], typer.Argument(metavar="DIR...", help="Case folders, or folders that hold case folders.")
+    ],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for results and tables; a rerun goes on.")],
+    preset: PresetOption = "balanced",
+    settings: SettingsOption = None,
+    jobs: Annotated[int, typer.Option(metavar="N", min=1, help="Cases run at once.")] = 1,
+    scheduler: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="Dask scheduler whose workers see the same files.")
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Localize and score many cases; one table of errors, gates, seconds and memory as CSV, Markdown and HTML."""
+    from vatsloc.study.cohort.cohort import as_json as cohort_json
+    from vatsloc.study.cohort.cohort import find_cases, run_cohort, table
+    from vatsloc.workflow.settings import load_settings
+
+    load_settings(preset, settings)
+    outcomes = run_cohort(find_cases(folders), out, preset, settings, jobs, scheduler, say=say)
+    if as_json:
+        show(cohort_json(outcomes))
+    else:
+        print(table(outcomes))
+
+
+def chart(
+    cases: Annotated[list[Path], typer.Argument(metavar="CASES...", help="Case folders with landmarks.")],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for runs.csv and the chart.")],
+    variants: Annotated[str | None, typer.Option(metavar="A,B,..", help="Variants to run; all by default.")] = None,
+    clock: Annotated[
+        Literal["seconds", "cpu"], typer.Option(help="What is drawn: the clock's seconds or the processors'.")
+    ] = "seconds",
+) -> None:
+    """Errors against seconds of the method's variants over CASES; goes on where it was stopped (extra "report")."""
+    from vatsloc.study.chart.chart import run_chart
+    from vatsloc.study.chart.draw import require_matplotlib, write_chart
+    from vatsloc.study.chart.variants import VARIANTS, chosen_variants
+
+    require_matplotlib()
+    chosen = chosen_variants([name.strip() for name in variants.split(",")] if variants else None)
+    write_chart(run_chart(cases, chosen, out, say), VARIANTS, out, clock)
+    print(out / "chart.html")
+
+
+def paper(
+    folders: Annotated[
+        list[Path], typer.Argument(metavar="DIR...", help="Case folders with landmarks, or folders that hold them.")
+    ],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for errors and tables; a rerun goes on.")],
+    jobs: Annotated[int, typer.Option(metavar="N", min=1, help="Cases run at once.")] = 1,
+) -> None:
+    """The experiments of Alvarez 2021 on cases with truth: variants A to C, diaphragm, parameters (extra "report")."""
+    from vatsloc.study.chart.draw import require_matplotlib
+    from vatsloc.study.cohort.cohort import find_cases
+    from vatsloc.study.paper.draw import write_paper
+    from vatsloc.study.paper.paper import run_paper
+
+    require_matplotlib()
+    write_paper(run_paper(find_cases(folders), out, jobs, say), out)
+    print(out / "paper.md")
