@@ -96,10 +96,11 @@ def determinant(f: Array) -> Array:
 
 
 @numba.njit(cache=True)
-def _at(c, ox, oy, oz, h, px, py, pz, x, f):
-    """Value x (3,) and gradient f (3, 3) of the map at one point."""
+def _at(c, origin, h, point, x, f):
+    """Value x (3,) and gradient f (3, 3) of the map at a point (3,)."""
     nx, ny, nz = c.shape[:3]
-    sx, sy, sz = (px - ox) / h, (py - oy) / h, (pz - oz) / h
+    px, py, pz = point[0], point[1], point[2]
+    sx, sy, sz = (px - origin[0]) / h, (py - origin[1]) / h, (pz - origin[2]) / h
     i = min(max(int(np.floor(sx + 0.5)), 1), nx - 2)
     j = min(max(int(np.floor(sy + 0.5)), 1), ny - 2)
     k = min(max(int(np.floor(sz + 0.5)), 1), nz - 2)
@@ -132,8 +133,7 @@ def _at(c, ox, oy, oz, h, px, py, pz, x, f):
 @numba.njit(cache=True)
 def _evaluate(c, origin, h, points, out, gradient):
     for n in range(len(points)):
-        p = points[n]
-        _at(c, origin[0], origin[1], origin[2], h, p[0], p[1], p[2], out[n], gradient[n])
+        _at(c, origin, h, points[n], out[n], gradient[n])
 
 
 @numba.njit(cache=True)
@@ -142,7 +142,7 @@ def _newton(c, origin, h, targets, source, left, tolerance):
     for n in range(len(targets)):
         p = source[n]
         for _ in range(25):
-            _at(c, origin[0], origin[1], origin[2], h, p[0], p[1], p[2], x, f)
+            _at(c, origin, h, p, x, f)
             r0, r1, r2 = targets[n, 0] - x[0], targets[n, 1] - x[1], targets[n, 2] - x[2]
             left[n] = np.sqrt(r0 * r0 + r1 * r1 + r2 * r2)
             if left[n] < tolerance:

@@ -15,7 +15,7 @@ from phantoms.imaging import State
 from phantoms.lobes import surface_points
 from phantoms.patient import Patient
 from phantoms.spec import Collapse, PhantomSpec
-from phantoms.tissue import Equilibrium, Pleura, Tie, Tissue, relax, tissue_points
+from phantoms.tissue import Equilibrium, Pleura, Scene, Tie, Tissue, relax, tissue_points
 
 Array = NDArray[Any]
 HINGE_MM = 13.0
@@ -80,7 +80,7 @@ class LungBody:
             ties.append(Tie(skin, motion(skin), SCAR_KPA_MM, lobe))
         pleura = _pleura(self.surface, lung, cavity, held)
         lobes = self.patient.lobes
-        return cavity, relax(t, pleura, ties, gravity, motion, volume_ratio, self.element_mm, lobes)
+        return cavity, relax(Scene(t, pleura, ties, lobes, gravity), motion, volume_ratio, self.element_mm)
 
 
 def lung_body(patient: Patient, collapse: Collapse, element_mm: float, rng: np.random.Generator) -> LungBody:

@@ -66,6 +66,17 @@ class Tie:
 
 
 @dataclass(frozen=True)
+class Scene:
+    """A lung and all that acts on it. gravity: (3,) unit vector."""
+
+    tissue: Tissue
+    pleura: Pleura
+    ties: Sequence[Tie]
+    lobes: Lobes
+    gravity: Array
+
+
+@dataclass(frozen=True)
 class Equilibrium:
     """Result of `relax`. history: out-of-balance force per step, relative to the first."""
 
@@ -85,24 +96,21 @@ def tissue_points(lung: Lattice, step_mm: float) -> tuple[Array, Array]:
 
 
 def relax(
-    tissue: Tissue,
-    pleura: Pleura,
-    ties: Sequence[Tie],
-    gravity: Array,
+    scene: Scene,
     guess: Callable[[Array], Array],
     volume_ratio: float | None,
     spacing_mm: float,
-    lobes: Lobes,
     limit: float = 1e-2,
 ) -> Equilibrium:
     """Equilibrium of the lung on splines of `spacing_mm`, from the start that maps CT points by `guess`.
 
-    gravity: (3,) unit vector; volume_ratio: volume over that in the CT, met by scaling the rest shape; None leaves it;
+    volume_ratio: volume over that in the CT, met by scaling the rest shape; None leaves it;
     limit: out-of-balance force at which to stop, over that of the start.
     """
+    tissue = scene.tissue
     low, high = tissue.points.min(axis=0) - 2.5 * spacing_mm, tissue.points.max(axis=0) + 2.5 * spacing_mm
     nx, ny, nz = (int(n) for n in np.ceil((high - low) / spacing_mm) + 1)
-    problem = _Problem(tissue, pleura, ties, gravity, lobes, low, spacing_mm, (nx, ny, nz))
+    problem = _Problem(scene, low, spacing_mm, (nx, ny, nz))
     u = problem.fit(guess)
     histories: list[Array] = []
     for _ in range(4):
@@ -114,23 +122,14 @@ def relax(
         rest = problem.tissue.rest * np.cbrt(volume_ratio / ratio)
         problem.tissue = replace(problem.tissue, rest=np.clip(rest, 0.5, 0.99))
     forces = np.concatenate(histories)
-    return Equilibrium(LobedMap(tuple(problem.maps(u)), lobes), status, forces / forces[0])
+    return Equilibrium(LobedMap(tuple(problem.maps(u)), scene.lobes), status, forces / forces[0])
 
 
 class _Problem:
     """Energy of the lung over the splines' active coefficients (n, 3), its gradient, and a fixed metric for steps."""
 
-    def __init__(
-        self,
-        tissue: Tissue,
-        pleura: Pleura,
-        ties: Sequence[Tie],
-        gravity: Array,
-        lobes: Lobes,
-        origin: Array,
-        spacing: float,
-        shape: tuple[int, int, int],
-    ) -> None:
+    def __init__(self, scene: Scene, origin: Array, spacing: float, shape: tuple[int, int, int]) -> None:
+        tissue, pleura, lobes = scene.tissue, scene.pleura, scene.lobes
         self.tissue, self.pleura, self.lobes = tissue, pleura, lobes
         self.origin, self.spacing, self.shape = origin, spacing, shape
         inside, *slopes = self._basis(tissue.points, tissue.lobe)
@@ -139,14 +138,14 @@ class _Problem:
         self.value = inside[:, self.active]
         self.slopes = [s[:, self.active] for s in slopes]
         self.on_pleura = self._basis(pleura.points, pleura.lobe)[0][:, self.active]
-        self.ties = [(tie, self._basis(tie.points, tie.lobe)[0][:, self.active]) for tie in ties]
+        self.ties = [(tie, self._basis(tie.points, tie.lobe)[0][:, self.active]) for tie in scene.ties]
         joint = make_joint(lobes, pleura.held)
         self.sides = joint.sides
         self.grown = [(self._jump(side), side.stiffness[:, None]) for side in joint.grown]
         self.lame = 1.5 * tissue.shear
         self.contact = (4.0 if pleura.held else 1.5) * pleura.area
         weight = tissue.density * 9.81e-6 * tissue.volume
-        self.load = (self.value.T @ weight)[:, None] * gravity
+        self.load = (self.value.T @ weight)[:, None] * scene.gravity
         stiff = tissue.volume * tissue.shear * tissue.rest
         self.smooth = self._roughness(spacing) * (0.02 * float(tissue.shear.mean()))
         laplace = sum((s.T @ (s * (3 * stiff)[:, None]) for s in self.slopes), start=self.smooth)

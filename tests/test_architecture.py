@@ -46,10 +46,11 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         "terminal": set(),
         "formats": {"errors", "frames", "lazy"},
         "imaging": {"errors", "frames", "lazy"},
-        "marks": {"errors", "frames", "formats"},
+        "overlap": {"errors"},
+        "marks": {"errors", "frames", "formats", "overlap"},
         "calibration": {"errors", "formats", "imaging"},
-        "case": {"errors", "frames", "formats", "marks", "imaging", "calibration"},
-        "new_case": {"errors", "formats", "imaging", "case"},
+        "case": {"errors", "frames", "formats", "marks", "imaging", "calibration", "overlap"},
+        "new_case": {"errors", "formats", "imaging", "case", "overlap"},
         "results": {"frames", "formats"},
         "report": {"frames", "lazy", "formats", "case", "results"},
         "dicomout": {"errors", "frames", "lazy", "maps", "formats", "case", "results", "report"},
@@ -86,6 +87,10 @@ FOREIGN: dict[str, set[str]] = {
 
 MAKERS = {"synthetic", "study"}
 """Rooms of vatsloc that may know phantoms. A run and its evaluation do not: they treat a phantom as any other case."""
+
+MOST_ARGUMENTS, MOST_LINES = 8, 350
+CROWDED = {"listen": "a command, whose arguments are options with names and defaults on the command line"}
+"""Functions that may take more arguments, and why."""
 
 
 def imported(file: Path) -> set[str]:
@@ -146,6 +151,28 @@ def test_only_what_makes_phantoms_and_studies_them_knows_them() -> None:
         if any(module.split(".")[0] == "phantoms" for module in imported(file))
     }
     assert knowing == MAKERS
+
+
+@pytest.mark.parametrize("package", [*ROOMS, "phantoms"])
+def test_functions_take_eight_arguments_at_most(package: str) -> None:
+    crowded = {}
+    for file in sorted((ROOT / package).rglob("*.py")):
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
+                given = node.args
+                names = [arg.arg for arg in given.posonlyargs + given.args + given.kwonlyargs]
+                if len([name for name in names if name not in ("self", "cls")]) > MOST_ARGUMENTS:
+                    crowded[getattr(node, "name", "lambda")] = str(file.relative_to(ROOT))
+    assert {name: file for name, file in crowded.items() if name not in CROWDED} == {}
+
+
+@pytest.mark.parametrize("package", [*ROOMS, "phantoms", "tests"])
+def test_files_have_350_lines_at_most(package: str) -> None:
+    lines = {
+        str(file.relative_to(ROOT)): len(file.read_text("utf-8").splitlines())
+        for file in sorted((ROOT / package).rglob("*.py"))
+    }
+    assert {file: count for file, count in lines.items() if count > MOST_LINES} == {}
 
 
 @pytest.mark.parametrize("package", ROOMS)

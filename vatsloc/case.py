@@ -27,11 +27,10 @@ from vatsloc.formats.meshes import Surface
 from vatsloc.frames import reorient
 from vatsloc.imaging.greyvalues import Calibration
 from vatsloc.imaging.side import SeenScans, ToldSide, nodule_side, told_side
-from vatsloc.marks import AXES, Nodule, NoduleSource, inside_of, mask_on, one_point, read_hint_surface, read_nodule
+from vatsloc.marks import AXES, Nodule, NoduleSource, mask_on, one_point, read_hint_surface, read_nodule
+from vatsloc.overlap import check_overlap, inside_of
 
 IMAGES = ("ct", "cbct_inflated", "cbct_deflated")
-MIN_OVERLAP = 0.2
-"""Share of the smaller image's box that must lie inside the other; headers promise poses within about 10 cm."""
 IMAGE_MM = (60.0, 3000.0)
 """Between these lies the longest side of any image of a chest, not of one in metres or micrometres."""
 
@@ -156,7 +155,7 @@ def _read(folder: Path, file: CaseFile, taken: tuple[str, ...]) -> _Read:
     grids = {name: volume.grid for name, volume in zip(taken, volumes, strict=True)}
     for number, a in enumerate(taken):
         for b in taken[number + 1 :]:
-            _check_overlap(grids[a], grids[b], paths[a], paths[b])
+            check_overlap(grids[a], grids[b], paths[a], paths[b])
     warnings = [sentence for sentences in said for sentence in sentences]
     named = dict(zip(taken, volumes, strict=True))
     images, calibration = in_hounsfield(named, paths, stated_maps(file.images), warnings)
@@ -271,29 +270,6 @@ def _read_image(path: Path, series: SeriesName | None) -> tuple[Volume, str, tup
         )
     hu, ras_from_ijk = reorient(volume.hu, volume.ras_from_ijk, AXES)
     return Volume(np.ascontiguousarray(hu), ras_from_ijk), axis_codes(volume.ras_from_ijk), warnings
-
-
-def _check_overlap(a: Grid, b: Grid, path_a: Path, path_b: Path) -> None:
-    share = image_overlap(a, b)
-    if share < MIN_OVERLAP:
-        centres = [grid.to_ras((np.array(grid.shape) - 1) / 2) for grid in (a, b)]
-        apart = float(np.linalg.norm(centres[0] - centres[1]))
-        raise InputRefused(
-            f"{path_a} and {path_b} overlap by {100 * share:.0f} % ({apart:.0f} mm between centres), "
-            f"{100 * MIN_OVERLAP:.0f} % needed; place them within about 10 cm of each other by their headers."
-        )
-
-
-def image_overlap(a: Grid, b: Grid) -> float:
-    """Share of the smaller of two images' boxes that lies inside the other."""
-    return max(_share_inside(a, b), _share_inside(b, a))
-
-
-def _share_inside(a: Grid, b: Grid) -> float:
-    """Share of a's box that lies inside b's."""
-    fractions = (np.arange(16) + 0.5) / 16
-    ijk = np.stack(np.meshgrid(*(fractions * n - 0.5 for n in a.shape), indexing="ij"), axis=-1)
-    return float(inside_of(b, a.to_ras(ijk)).mean())
 
 
 def _hints(

@@ -20,6 +20,7 @@ from vatsloc.formats.markups import read_points
 from vatsloc.formats.meshes import Surface, read_surface
 from vatsloc.formats.segments import Label
 from vatsloc.frames import reorient
+from vatsloc.overlap import inside_of
 
 AXES = "LPS"
 MAX_POINT_TO_MASK_MM = 10.0
@@ -130,12 +131,6 @@ def one_point(path: Path, warnings: list[str] | None = None) -> Array:
     if points.unplaced and warnings is not None:
         warnings.append(f"{path.name}: {', '.join(points.unplaced)} was never placed and was left out.")
     return points.ras[0]
-
-
-def inside_of(grid: Grid, points_ras: Array) -> Array:
-    """Whether points (..., 3) lie in the box of a grid's voxels, (...) bool."""
-    ijk = grid.to_ijk(points_ras)
-    return np.asarray(((ijk >= -0.5) & (ijk <= np.array(grid.shape) - 0.5)).all(axis=-1))
 
 
 def _some_voxels(mask: Mask) -> Array:

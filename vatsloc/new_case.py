@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from registration.volume import Array, Grid, Volume
-from vatsloc.case import Case, image_overlap, read_case
+from vatsloc.case import Case, read_case
 from vatsloc.errors import CaseError, InputRefused, VatslocError
 from vatsloc.formats.casefile import FILE_NAME
 from vatsloc.formats.folder import whole_folder
@@ -21,6 +21,7 @@ from vatsloc.formats.images import files_behind
 from vatsloc.formats.markups import PointList, write_points
 from vatsloc.imaging.greyvalues import peaks
 from vatsloc.imaging.side import pleural_gas, seen_scans
+from vatsloc.overlap import image_overlap
 
 LONG_SUFFIXES = (".nii.gz", ".mrk.json", ".seg.nrrd")
 POINT_SUFFIXES = (".mrk.json", ".json", ".fcsv")

@@ -23,9 +23,12 @@ class ByOption(TyperGroup):
 
     def parse_args(self, ctx: typer.Context, args: list[str]) -> list[str]:  # type: ignore[override]
         """The arguments, begun by the name of a subcommand."""
-        if args and args[0] not in self.commands and args[0] not in self.get_help_option_names(ctx):
-            args = [subcommand_of(args), *args]
-        return super().parse_args(ctx, args)
+        asks_help = args and args[0] in self.get_help_option_names(ctx)
+        return super().parse_args(ctx, args if asks_help else self.named(args))
+
+    def named(self, args: list[str]) -> list[str]:
+        """Arguments with the name of the subcommand that they ask for."""
+        return args if not args or args[0] in self.commands else [subcommand_of(args), *args]
 
 
 def subcommand_of(args: list[str]) -> str:

@@ -13,7 +13,7 @@ from phantoms.fields import Lattice, as_distance, lattice_over
 from phantoms.fissure_contact import contact_energy, make_joint
 from phantoms.lobes import Fissures, LobedMap, Lobes, Sheet, cut, surface_points
 from phantoms.spline import SplineMap
-from phantoms.tissue import Equilibrium, Pleura, Tie, Tissue, _Problem, relax, tissue_points
+from phantoms.tissue import Equilibrium, Pleura, Scene, Tie, Tissue, _Problem, relax, tissue_points
 
 RADIUS = 40.0
 PLANE = Sheet(np.zeros(3), 0.0, 0.0, 0.0)
@@ -55,7 +55,7 @@ def _parts(lobes: Lobes, wall: Lattice, moved: np.ndarray, held: bool = False) -
 def _moved(lobes: Lobes, ball: Lattice, moved: list[float]) -> Equilibrium:
     room = ball.like(ball.values - 25)
     parts = _parts(lobes, room, np.array(moved))
-    return relax(*parts, DOWN, lambda p: p, None, 16.0, lobes, limit=1e-4)
+    return relax(Scene(*parts, lobes, DOWN), lambda p: p, None, 16.0, limit=1e-4)
 
 
 def test_halves_share_the_ball_and_face_each_other_over_its_disc(ball: Lattice, halves: Lobes) -> None:
@@ -126,7 +126,7 @@ def test_pushes_between_lobes_cancel(halves: Lobes) -> None:
 def test_energy_of_lobes_falls_along_its_gradient_at_the_rate_it_says(ball: Lattice, halves: Lobes, held: bool) -> None:
     some = replace(halves, fissures=replace(halves.fissures, grown_mm=15.0))
     tissue, pleura, ties = _parts(some, ball, np.array([3.0, 0, 0]), held)
-    problem = _Problem(tissue, pleura, ties, DOWN, some, np.full(3, -80.0), 20.0, (9, 9, 9))
+    problem = _Problem(Scene(tissue, pleura, ties, some, DOWN), np.full(3, -80.0), 20.0, (9, 9, 9))
     rng = np.random.default_rng(1)
     u = rng.normal(0, 0.5, (len(problem.active), 3))
     way = rng.standard_normal(u.shape)

@@ -11,9 +11,10 @@ from numpy.testing import assert_allclose
 from phantoms.descent import Status
 from phantoms.fields import Lattice, as_distance, lattice_over
 from phantoms.lobes import Fissures, Lobes, Sheet, surface_points, whole
-from phantoms.tissue import Pleura, Tie, Tissue, _Problem, relax, tissue_points
+from phantoms.tissue import Pleura, Scene, Tie, Tissue, _Problem, relax, tissue_points
 
 RADIUS = 40.0
+DOWN = np.array([0, 0, -1.0])
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +49,7 @@ def test_points_and_surface_measure_a_ball(ball: Lattice) -> None:
 
 def test_free_weightless_lung_takes_its_rest_shape(ball: Lattice) -> None:
     tissue, pleura, ties = _parts(ball, 0.8, 0.0, held=False)
-    end = relax(tissue, pleura, ties, np.array([0, 0, -1.0]), _same, None, 16.0, _one(ball))
+    end = relax(Scene(tissue, pleura, ties, _one(ball), DOWN), _same, None, 16.0)
     assert end.status is Status.CONVERGED
     inner = tissue.points[np.linalg.norm(tissue.points, axis=1) < 30]
     assert_allclose(end.state_from_ct.determinant(inner), 0.8**3, rtol=0.03)
@@ -57,7 +58,7 @@ def test_free_weightless_lung_takes_its_rest_shape(ball: Lattice) -> None:
 
 def test_held_lung_keeps_to_the_wall_although_it_pulls(ball: Lattice) -> None:
     tissue, pleura, ties = _parts(ball, 0.8, 0.0, held=True)
-    end = relax(tissue, pleura, ties, np.array([0, 0, -1.0]), _same, None, 16.0, _one(ball))
+    end = relax(Scene(tissue, pleura, ties, _one(ball), DOWN), _same, None, 16.0)
     gap = ball.at(end.state_from_ct(pleura.points))
     assert_allclose(gap, 0, atol=0.5)
     # Tension pulls the pleura inwards: a negative distance.
@@ -67,7 +68,7 @@ def test_held_lung_keeps_to_the_wall_although_it_pulls(ball: Lattice) -> None:
 def test_weight_pulls_a_collapsed_lung_down_onto_the_wall(ball: Lattice) -> None:
     tissue, pleura, ties = _parts(ball, 0.8, 600.0, held=False)
     ties = [replace(ties[0], stiffness=1e-3)]
-    end = relax(tissue, pleura, ties, np.array([0, 0, -1.0]), _same, None, 16.0, _one(ball))
+    end = relax(Scene(tissue, pleura, ties, _one(ball), DOWN), _same, None, 16.0)
     moved = end.state_from_ct(tissue.points)
     fall = (moved[:, 2] * tissue.volume).sum() / tissue.volume.sum()
     assert -20 < fall < -2
@@ -78,14 +79,15 @@ def test_weight_pulls_a_collapsed_lung_down_onto_the_wall(ball: Lattice) -> None
 
 def test_rest_shape_is_scaled_to_the_volume_asked_for(ball: Lattice) -> None:
     tissue, pleura, ties = _parts(ball, 0.9, 200.0, held=False)
-    end = relax(tissue, pleura, ties, np.array([0, -1.0, 0]), _same, 0.5, 16.0, _one(ball))
+    end = relax(Scene(tissue, pleura, ties, _one(ball), np.array([0, -1.0, 0])), _same, 0.5, 16.0)
     ratio = end.state_from_ct.determinant(tissue.points) @ tissue.volume / tissue.volume.sum()
     assert ratio == pytest.approx(0.5, rel=0.01)
 
 
 def test_energy_falls_along_its_gradient_at_the_rate_it_says(ball: Lattice) -> None:
     tissue, pleura, ties = _parts(ball, 0.8, 300.0, held=True)
-    problem = _Problem(tissue, pleura, ties, np.array([0.6, 0, -0.8]), _one(ball), np.full(3, -80.0), 20.0, (9, 9, 9))
+    scene = Scene(tissue, pleura, ties, _one(ball), np.array([0.6, 0, -0.8]))
+    problem = _Problem(scene, np.full(3, -80.0), 20.0, (9, 9, 9))
     rng = np.random.default_rng(1)
     u = rng.normal(0, 0.8, (len(problem.active), 3))
     way = rng.standard_normal(u.shape)
@@ -96,6 +98,6 @@ def test_energy_falls_along_its_gradient_at_the_rate_it_says(ball: Lattice) -> N
 
 def test_tissue_turned_inside_out_has_no_finite_energy(ball: Lattice) -> None:
     tissue, pleura, ties = _parts(ball, 0.8, 0.0, held=True)
-    problem = _Problem(tissue, pleura, ties, np.array([0, 0, -1.0]), _one(ball), np.full(3, -80.0), 20.0, (9, 9, 9))
+    problem = _Problem(Scene(tissue, pleura, ties, _one(ball), DOWN), np.full(3, -80.0), 20.0, (9, 9, 9))
     u = problem.fit(lambda p: p * [-1, 1, 1])
     assert problem.energy(u)[0] == np.inf

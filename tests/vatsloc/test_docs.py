@@ -15,6 +15,7 @@ import typer
 from tests.vatsloc.test_results import result
 from vatsloc.cli import app
 from vatsloc.formats.casefile import CaseFile
+from vatsloc.phantom_command import ByOption
 from vatsloc.results import OUTPUT_FILES, write_results
 from vatsloc.workflow.settings import Settings
 
@@ -96,6 +97,7 @@ def test_commands_of_a_page_are_understood(page: Path) -> None:
         words = shlex.split(line, comments=True)[1:]
         command: Any = typer.main.get_command(app)
         while words and hasattr(command, "commands"):
+            words = command.named(words) if isinstance(command, ByOption) else words
             assert words[0] in command.commands, f"{page.name}: {line}"
             command, words = command.commands[words[0]], words[1:]
         if words:
