@@ -1,10 +1,10 @@
 """Mechanics of a breathing lung: what moves it, and what it settles to.
 
 `breathe_out` is the elastic lung that the wall of another state pulls; `balance` finds the equilibrium at finite strain
-of a `Scene`: tissue, suction, springs and a cavity.
+of a `Scene`: tissue, pressure, point constraints and a cavity.
 """
 
 from poro.breathing.elastic import Breathing, Lung, breathe_out
-from poro.breathing.equilibrium import Scene, Springs, balance
+from poro.breathing.equilibrium import PointConstraints, Scene, balance
 
-__all__ = ["Breathing", "Lung", "Scene", "Springs", "balance", "breathe_out"]
+__all__ = ["Breathing", "Lung", "PointConstraints", "Scene", "balance", "breathe_out"]

@@ -13,7 +13,7 @@ from scipy.sparse import csr_matrix, diags
 
 from poro.arrays import Array
 from poro.breathing.elastic import WALL_KPA_PER_MM, Breathing, Lung, caudal, hilum, spread_map
-from poro.breathing.equilibrium import Cavity, Scene, Springs, tree_of
+from poro.breathing.equilibrium import Cavity, PointConstraints, Scene, tree_of
 from poro.contact.levelset import level_set
 from poro.fem.constitutive import ConstitutiveModel, neo_hookean
 from poro.fem.tissue import GRAVITY_KPA_PER_MM, Tissue
@@ -50,7 +50,9 @@ class Inflating:
         """What acts at a share of the way; nodes that start behind the wall are let back in little by little."""
         wall = self.cavity
         cavity = Cavity(wall.level, wall.nodes, wall.stiffness, (1 - share) * wall.offset)
-        return Scene(self.mesh, self.material, Springs(self.matrix, share * self.load), cavity=cavity, tree=self.tree)
+        return Scene(
+            self.mesh, self.material, PointConstraints(self.matrix, share * self.load), cavity=cavity, tree=self.tree
+        )
 
 
 def inflating(lung: Lung, acting: Breathing, material: ConstitutiveModel | None = None) -> Inflating:
@@ -58,12 +60,12 @@ def inflating(lung: Lung, acting: Breathing, material: ConstitutiveModel | None 
     tissue, mesh, border = Tissue(), lung.expired, lung.expired.boundary
     level = level_set(lung.inspired.boundary, STEP_MM, SMOOTH_MM)
     behind = np.minimum(level.evaluate(border.points)[0], 0)
-    springs, load = rising(lung, acting, tissue)
+    constraints, load = rising(lung, acting, tissue)
     return Inflating(
         mesh,
         material or neo_hookean(tissue),
         Cavity(level, border.nodes, WALL_KPA_PER_MM * border.node_areas, behind),
-        springs,
+        constraints,
         load,
         spread_map(mesh, lung.inspired)(mesh.points) - mesh.points,
         float(lung.inspired.volumes.sum()),
@@ -72,8 +74,8 @@ def inflating(lung: Lung, acting: Breathing, material: ConstitutiveModel | None 
 
 
 def rising(lung: Lung, acting: Breathing, tissue: Tissue) -> tuple[csr_matrix, Array]:
-    """Springs (3n, 3n) that hold the expired lung's bronchi, and forces (n, 3) kPa mm2 at the end of its inspiration:
-    the weight that no longer sags it, and the front's rise with the ribs.
+    """Stiffness (3n, 3n) of what holds the expired lung's bronchi, and forces (n, 3) kPa mm2 at the end of its
+    inspiration: the weight that no longer sags it, and the front's rise with the ribs.
     """
     mesh = lung.expired
     root = hilum(mesh, lung.side)

@@ -48,8 +48,8 @@ class Breathing:
     """What acts on a lung that breathes out, besides its wall.
 
     mass_kg: weight beyond what the inspired lung bears, of one lung and in units of the tissue's stiffness;
-    held_kpa_mm: springs of the bronchi along the body, in all, within about `held_mm` of the hilum; turn: share of the
-    ribs' turn that the tissue follows; mediastinal: trust in the mediastinal wall, where masks are cut at will.
+    held_kpa_mm: stiffness of the bronchi along the body, in all, within about `held_mm` of the hilum; turn: share of
+    the ribs' turn that the tissue follows; mediastinal: trust in the mediastinal wall, where masks are cut at will.
     """
 
     mass_kg: float = 0.23
@@ -134,8 +134,8 @@ def hilum(lung: TetMesh, side: Side) -> Array:
 
 
 def bronchi(lung: Lung, acting: Breathing) -> tuple[Array, Array]:
-    """Springs along the body: stiffness (n,) kPa mm, which fades with distance from the hilum, and motion (n,) mm that
-    they ask for: none at the hilum's height, and towards the feet in front of it.
+    """Constraints along the body: stiffness (n,) kPa mm, which fades with distance from the hilum, and motion (n,) mm
+    that they ask for: none at the hilum's height, and towards the feet in front of it.
 
     Ribs slant, about 45 degrees, and turn about the spine: as the front sinks it falls as far (pump handle), and the
     whole turns by what the chest loses of its depth.
@@ -149,7 +149,7 @@ def bronchi(lung: Lung, acting: Breathing) -> tuple[Array, Array]:
 
 
 def _wall(lung: Lung, rest: TetMesh, u: Array, mediastinal: float, robust_mm: float) -> tuple[csr_matrix, Array]:
-    """Springs of the expired wall, from its points to the lung's surface and back, along the wall's normals."""
+    """Constraints of the expired wall, from its points to the lung's surface and back, along the wall's normals."""
     inner, onto = rest.boundary, lung.expired.boundary
     moved = inner.moved(inner.points + u[inner.nodes])
     there, back = closest_points(moved, onto.points), closest_points(onto, moved.points)

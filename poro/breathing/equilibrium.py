@@ -1,4 +1,4 @@
-"""Equilibrium of a lung at finite strain under suction, weight, springs and a cavity that it may not leave.
+"""Equilibrium of a lung at finite strain under pressure, weight, constraints and a cavity that it may not leave.
 
 Newton with line search; where the tangent has no lowest energy its convex part serves. Displacements mm, pressures kPa.
 Ref: Bonet & Wood 2008, ch. 9 (Newton, follower pressure); Eom 2010, eq. 1.
@@ -35,19 +35,19 @@ class Balance(Enum):
 
 
 @dataclass(frozen=True)
-class Springs:
+class PointConstraints:
     """Energy u K u / 2 - f u. matrix: (3n, 3n) kPa mm; force: (n, 3) kPa mm2."""
 
     matrix: csr_matrix
     force: Array
 
-    def __add__(self, other: Springs) -> Springs:
-        return Springs((self.matrix + other.matrix).tocsr(), self.force + other.force)
+    def __add__(self, other: PointConstraints) -> PointConstraints:
+        return PointConstraints((self.matrix + other.matrix).tocsr(), self.force + other.force)
 
     @staticmethod
-    def none(nodes: int) -> Springs:
-        """No spring at all."""
-        return Springs(csr_matrix((3 * nodes, 3 * nodes)), np.zeros((nodes, 3)))
+    def none(nodes: int) -> PointConstraints:
+        """No constraint at all."""
+        return PointConstraints(csr_matrix((3 * nodes, 3 * nodes)), np.zeros((nodes, 3)))
 
 
 @dataclass(frozen=True)
@@ -72,14 +72,14 @@ class Cavity:
 
 @dataclass(frozen=True)
 class Scene:
-    """Tissue and all that acts on it. suction_kpa: of the pleura, uniform over the surface whatever its shape;
-    springs: wall, bronchi and dead loads.
+    """Tissue and all that acts on it. transpulmonary_kpa: uniform over the surface whatever its shape;
+    constraints: wall, bronchi and dead loads.
     """
 
     mesh: TetMesh
     material: ConstitutiveModel
-    springs: Springs
-    suction_kpa: float = 0.0
+    constraints: PointConstraints
+    transpulmonary_kpa: float = 0.0
     cavity: Cavity | None = None
     tree: Tree | None = field(default=None, repr=False)
 
@@ -130,13 +130,15 @@ def volume(mesh: TetMesh, u: Array) -> float:
 
 
 def _linearized(scene: Scene, u: Array) -> tuple[Array, float, tuple[Array, csr_matrix]]:
-    """Unbalanced forces (n, 3), the scale of the loads, and moduli and the springs' matrix at u."""
+    """Unbalanced forces (n, 3), the scale of the loads, and moduli and the constraints' matrix at u."""
     f = deformation_gradient(scene.mesh, u)
     _, stress, moduli = _tissue(scene, f)
-    drawn = scene.springs.force - (scene.springs.matrix @ u.ravel()).reshape(-1, 3)
+    drawn = scene.constraints.force - (scene.constraints.matrix @ u.ravel()).reshape(-1, 3)
     unbalanced = drawn - eigenstress_load(scene.mesh, stress)
-    matrix = scene.springs.matrix
-    scale = max(float(np.abs(drawn).max()), abs(scene.suction_kpa) * float(scene.mesh.boundary.node_areas.mean()), 1e-9)
+    matrix = scene.constraints.matrix
+    scale = max(
+        float(np.abs(drawn).max()), abs(scene.transpulmonary_kpa) * float(scene.mesh.boundary.node_areas.mean()), 1e-9
+    )
     if scene.cavity is not None:
         _, force, blocks = scene.cavity.respond(scene.mesh.points + u)
         unbalanced = unbalanced + force
@@ -163,11 +165,11 @@ def _step(
 
 
 def _tissue(scene: Scene, f: Array) -> tuple[Array, Array, Array]:
-    """Tissue less the work of the suction on the volume: energy -p J, whose stress is -p J F^-T."""
+    """Tissue less the work of the pressure on the volume: energy -p J, whose stress is -p J F^-T."""
     energy, stress, moduli = scene.material.respond(f)
-    if scene.suction_kpa == 0.0:
+    if scene.transpulmonary_kpa == 0.0:
         return energy, stress, moduli
-    p = scene.suction_kpa * np.linalg.det(f)
+    p = scene.transpulmonary_kpa * np.linalg.det(f)
     inverse = np.linalg.inv(f).transpose(0, 2, 1)
     pairs = np.einsum("mij,mkl->mijkl", inverse, inverse)
     turned = pairs - pairs.transpose(0, 1, 4, 3, 2)
@@ -179,10 +181,10 @@ def energy_of(scene: Scene, u: Array) -> float:
     f = deformation_gradient(scene.mesh, u)
     if not (np.linalg.det(f) > 0).all():
         return np.inf
-    tissue = scene.material.respond(f)[0] - scene.suction_kpa * np.linalg.det(f)
-    springs = u.ravel() @ (scene.springs.matrix @ u.ravel()) / 2 - (scene.springs.force * u).sum()
+    tissue = scene.material.respond(f)[0] - scene.transpulmonary_kpa * np.linalg.det(f)
+    constraints = u.ravel() @ (scene.constraints.matrix @ u.ravel()) / 2 - (scene.constraints.force * u).sum()
     wall = 0.0 if scene.cavity is None else scene.cavity.respond(scene.mesh.points + u)[0]
-    return float(tissue @ scene.mesh.volumes + springs + wall)
+    return float(tissue @ scene.mesh.volumes + constraints + wall)
 
 
 def _length(scene: Scene, u: Array, change: Array, slope: float) -> float | None:

@@ -1,4 +1,4 @@
-"""A lung filled to a given volume inside a cavity: the suction that holds it there is an unknown of the same Newton.
+"""A lung filled to a given volume inside a cavity: the transpulmonary pressure is an unknown of the same Newton.
 
 Ref: Eom 2010, section II B (pressure by volume, sliding contact without friction); Riks 1979 (bordered systems).
 """
@@ -19,19 +19,19 @@ from poro.linalg.solver import linear_solver
 STEPS = 10
 _HALVINGS = 8
 VOLUME_KPA = 60.0
-"""Stiffness of the spring that holds the volume: a suction of 0.6 kPa leaves one hundredth of it missing."""
+"""Stiffness of the spring that holds the volume: a pressure of 0.6 kPa leaves one hundredth of it missing."""
 CLOSE_MM = 0.3
 """Largest change of a node in a step at which the lung has settled."""
 
 
 @dataclass(frozen=True)
 class Filled:
-    """A lung at a volume. u: (n, 3) mm; suction_kpa: that holds it; steps: of Newton; settled: whether the last one was
-    below `CLOSE_MM`; volume_mm3: reached.
+    """A lung at a volume. u: (n, 3) mm; transpulmonary_kpa: that holds it; steps: of Newton; settled: whether the last
+    one was below `CLOSE_MM`; volume_mm3: reached.
     """
 
     u: Array
-    suction_kpa: float
+    transpulmonary_kpa: float
     steps: int
     settled: bool
     volume_mm3: float
@@ -55,9 +55,9 @@ def fill(
 
 
 def fill_to(scene: Scene, wanted_mm3: float, u: Array) -> Filled:
-    """Displacement at which the forces balance and the volume is all but `wanted_mm3`, and the suction that asks for.
+    """Displacement at which the forces balance and the volume is all but `wanted_mm3`, and the pressure that asks for.
 
-    Energy descent: tissue, springs, cavity and a stiff spring on the volume, whose force is the suction.
+    Energy descent: tissue, constraints, cavity and a stiff spring on the volume, whose force is the pressure.
     """
     rest_mm3 = float(scene.mesh.volumes.sum())
     settled, taken = False, 0
@@ -65,16 +65,16 @@ def fill_to(scene: Scene, wanted_mm3: float, u: Array) -> Filled:
         u = u / 2
     while taken < STEPS and not settled:
         taken += 1
-        suction = VOLUME_KPA * (wanted_mm3 - volume(scene.mesh, u)) / rest_mm3
+        pressure = VOLUME_KPA * (wanted_mm3 - volume(scene.mesh, u)) / rest_mm3
         swell = _swelling(scene, u)
         rest, matrix = _linearized(scene, u)
         solver = linear_solver(matrix, scene.mesh.points, scene.tree)
-        solved = solver.solve(np.stack([(rest + suction * swell).ravel(), swell.ravel()], axis=1))
+        solved = solver.solve(np.stack([(rest + pressure * swell).ravel(), swell.ravel()], axis=1))
         free, forced = (solved[:, k].reshape(-1, 3) for k in range(2))
         # Sherman and Morrison: the volume's spring adds a product of one vector with itself to the matrix.
         share = VOLUME_KPA / rest_mm3
         change = free - forced * (share * (swell * free).sum() / (1 + share * (swell * forced).sum()))
-        length = _length(scene, u, change, wanted_mm3, float(((rest + suction * swell) * change).sum()))
+        length = _length(scene, u, change, wanted_mm3, float(((rest + pressure * swell) * change).sum()))
         if length is None:
             break
         u = u + length * change
@@ -111,15 +111,15 @@ def _swelling(scene: Scene, u: Array) -> Array:
 
 
 def _linearized(scene: Scene, u: Array) -> tuple[Array, csr_matrix]:
-    """Unbalanced forces (n, 3) without suction, and the convex part of their tangent.
+    """Unbalanced forces (n, 3) without pressure, and the convex part of their tangent.
 
-    The suction's own tangent cancels but at the surface, and is left out: it can only slow the descent down.
+    The pressure's own tangent cancels but at the surface, and is left out: it can only slow the descent down.
     """
     _, stress, moduli = scene.material.respond(deformation_gradient(scene.mesh, u))
     moduli = convex(moduli.reshape(-1, 9, 9)).reshape(moduli.shape)
-    rest = scene.springs.force - (scene.springs.matrix @ u.ravel()).reshape(-1, 3)
+    rest = scene.constraints.force - (scene.constraints.matrix @ u.ravel()).reshape(-1, 3)
     rest = rest - eigenstress_load(scene.mesh, stress)
-    matrix = tangent_stiffness(scene.mesh, moduli) + scene.springs.matrix
+    matrix = tangent_stiffness(scene.mesh, moduli) + scene.constraints.matrix
     if scene.cavity is not None:
         _, force, blocks = scene.cavity.respond(scene.mesh.points + u)
         rest = rest + force

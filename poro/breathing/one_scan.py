@@ -1,7 +1,7 @@
 """A lung of which one scan is known: where it is held, where it slides, what pulls it. Ref: Li & Porikli 2014, sec. 3.
 
 The apex is held; the flanks move in the axial plane alone; beside the spine tissue slides along the body alone; the
-diaphragm is pulled towards the feet by a traction, and the whole surface outward by the suction.
+diaphragm is pulled towards the feet by a traction, and the whole surface outward by the transpulmonary pressure.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from scipy.sparse.csgraph import connected_components
 
 from poro.arrays import Array
 from poro.breathing.elastic import Side, caudal, depth_of
-from poro.breathing.equilibrium import Scene, Springs, tree_of
+from poro.breathing.equilibrium import PointConstraints, Scene, tree_of
 from poro.breathing.inflation import Filled, fill_to
 from poro.fem.constitutive import ConstitutiveModel
 from poro.fem.hyperelastic import ogden_lung
@@ -27,12 +27,12 @@ APEX_SHARE, FLANK_SHARE, SPINE_SHARE = 0.08, (0.1, 0.7), 0.4
 FACING = 0.5
 """Least cosine between a surface and the way it is said to face."""
 TRACTION = 0.25
-"""Of the diaphragm over the suction. Ref: Li & Porikli 2014, section 5 (0.005 beside 0.02)."""
+"""Of the diaphragm over the pressure. Ref: Li & Porikli 2014, section 5 (0.005 beside 0.02)."""
 CHEST_SHARE = 0.45
 """Of a breath's volume that the ribs make, supine; the diaphragm makes the rest. Ref: Konno & Mead 1967 (two ways)."""
 WALL_KPA_PER_MM, DIAPHRAGM_KPA_PER_MM = 0.3, 0.03
-"""Springs that ask the border for that motion: along the normal of chest, back and mediastinum, along the body for the
-diaphragm. The paper lets the border go free; nothing but the apex then keeps a lung from turning."""
+"""Constraints that ask the border for that motion: along the normal of chest, back and mediastinum, along the body for
+the diaphragm. The paper lets the border go free; nothing but the apex then keeps a lung from turning."""
 MASS_KG = 0.23
 """Weight by which tissue sags at the end of a deep expiration, as in `elastic.Breathing`; none in a quiet one."""
 FIRM = 1e3
@@ -73,11 +73,11 @@ def regions(surface: TriSurface, side: Side, towards_feet: float) -> Regions:
 @dataclass(frozen=True)
 class OneScan:
     """The scene of a lung that no other scan constrains. pull: (n, 3) kPa mm2 of a traction of 1 kPa;
-    wanted: (n, 3) kPa mm2 of the springs that ask for a breath of 1 mm3; weight: (n, 3) kPa mm2."""
+    wanted: (n, 3) kPa mm2 of the constraints that ask for a breath of 1 mm3; weight: (n, 3) kPa mm2."""
 
     mesh: TetMesh
     material: ConstitutiveModel
-    springs: Springs
+    constraints: PointConstraints
     pull: Array
     regions: Regions
     bulk_kpa: float
@@ -85,7 +85,7 @@ class OneScan:
     weight: Array
 
     def states(self, volumes_mm3: Sequence[float], traction: float = TRACTION) -> list[Filled]:
-        """The lung at each volume, one after the other; traction: of the diaphragm, over the suction."""
+        """The lung at each volume, one after the other; traction: of the diaphragm, over the pressure."""
         rest, tree = float(self.mesh.volumes.sum()), tree_of(self.mesh)
         found: list[Filled] = []
         u, before = np.zeros_like(self.mesh.points), 0.0
@@ -95,8 +95,8 @@ class OneScan:
             start = u * (share / before) if abs(before) > 1e-6 and abs(share / before) < 3 else u
             sag = depth_of(wanted / rest) * (1.0 if wanted < rest else -1.0)
             force = tension * self.pull + (wanted - rest) * self.wanted + sag * self.weight
-            springs = Springs(self.springs.matrix, self.springs.force + force)
-            scene = Scene(self.mesh, self.material, springs, tree=tree)
+            constraints = PointConstraints(self.constraints.matrix, self.constraints.force + force)
+            scene = Scene(self.mesh, self.material, constraints, tree=tree)
             filled = fill_to(scene, wanted, start)
             found.append(filled)
             u, before = filled.u, share
@@ -118,15 +118,15 @@ def one_scan(mesh: TetMesh, side: Side, material: ConstitutiveModel | None = Non
     pull[nodes[where.diaphragm], 2] = feet * surface.node_areas[where.diaphragm]
     anchors = held + 1e-6 * tissue.young_kpa * np.cbrt(mesh.node_volumes)[:, None]
     matrix, wanted = _wall(mesh, side, where, feet)
-    springs = Springs((diags(anchors.ravel()) + matrix).tocsr(), np.zeros_like(mesh.points))
+    constraints = PointConstraints((diags(anchors.ravel()) + matrix).tocsr(), np.zeros_like(mesh.points))
     bulk = tissue.lame_kpa + 2 * tissue.shear_kpa / 3
     weight = np.zeros_like(mesh.points)
     weight[:, 1] = -MASS_KG * 1e9 * GRAVITY_KPA_PER_MM * mesh.node_volumes / mesh.volumes.sum()
-    return OneScan(mesh, material or ogden_lung(tissue), springs, pull, where, bulk, wanted, weight)
+    return OneScan(mesh, material or ogden_lung(tissue), constraints, pull, where, bulk, wanted, weight)
 
 
 def _wall(mesh: TetMesh, side: Side, where: Regions, feet: float) -> tuple[bsr_matrix, Array]:
-    """Springs of the border, and their forces (n, 3) when they ask for a breath of 1 mm3.
+    """Constraints of the border, and their forces (n, 3) when they ask for a breath of 1 mm3.
 
     The chest's front and flank go outward by one distance, the diaphragm towards the feet by another; back and
     mediastinum stay.

@@ -16,7 +16,7 @@ from scipy.sparse import coo_matrix, csr_matrix, diags
 from poro.arrays import Array
 from poro.breathing.cavity import rising
 from poro.breathing.elastic import Breathing, Lung, Side, caudal, hilum
-from poro.breathing.equilibrium import Springs
+from poro.breathing.equilibrium import PointConstraints
 from poro.fem.constraints import point_constraints
 from poro.fem.forms import tangent_stiffness
 from poro.fem.tissue import Tissue
@@ -52,7 +52,7 @@ STILL_MM = 0.3
 class Thorax:
     """Three bodies in one mesh that share no node. lung: (nl,) nodes that belong to the lung, first in the mesh;
     walls: inner surface of chest and of what is below, in nodes of the mesh; patch: (t,) of every triangle of `walls`,
-    -1 for none; gap: (k,) mm between the lung's border and the walls at rest; anchors: springs that hold
+    -1 for none; gap: (k,) mm between the lung's border and the walls at rest; anchors: constraints that hold
     the chest and the lung's bronchi; load: (n, 3) kPa mm2 on the lung at the end of an inspiration.
     """
 
@@ -122,10 +122,10 @@ def thorax(inside: Array, ras_from_ijk: Array, pair: Lung, acting: Breathing, ed
     walls, patch = _walls(bodies, starts, lung, points)
     gap = closest_points(walls, lung.boundary.points)
     rest = np.einsum("qd,qd->q", lung.boundary.points - gap.points, walls.normals[gap.triangle])
-    springs, load = np.zeros(3 * len(points)), np.zeros_like(points)
+    constraints, load = np.zeros(3 * len(points)), np.zeros_like(points)
     bronchi, load[: len(lung.points)] = rising(pair, acting, LUNG)
-    springs[: 3 * len(lung.points)] = bronchi.diagonal()
-    anchors = (_anchors(bodies, starts, points, pair, towards) + diags(springs)).tocsr()
+    constraints[: 3 * len(lung.points)] = bronchi.diagonal()
+    anchors = (_anchors(bodies, starts, points, pair, towards) + diags(constraints)).tocsr()
     return Thorax(mesh, _elastic(mesh, kinds), lung, walls, patch, rest, anchors, load)
 
 
@@ -222,8 +222,8 @@ def _distances(
     return residual, slope, mean
 
 
-def _contact(scene: Thorax, u: Array) -> Springs:
-    """Springs along the walls' normals that keep the gap at rest between lung and walls, wherever the lung slid to."""
+def _contact(scene: Thorax, u: Array) -> PointConstraints:
+    """Contact along the walls' normals that keeps the gap at rest between lung and walls, wherever the lung slid to."""
     border = scene.lung.boundary
     walls = scene.walls.moved(scene.walls.points + u[scene.walls.nodes])
     here = border.points + u[border.nodes]
@@ -241,7 +241,7 @@ def _contact(scene: Thorax, u: Array) -> Springs:
     # Where a wall is missing, between chest and diaphragm, the nearest one is none of the lung's.
     area = border.moved(here).node_areas * (np.abs(scene.gap) < TOUCH_MM) * (np.abs(apart - scene.gap) < 2 * TOUCH_MM)
     stiffness = STICK_KPA_PER_MM * area[:, None, None] * normal[:, :, None] * normal[:, None, :]
-    return Springs(*point_constraints(operator, stiffness, wanted[:, None] * normal))
+    return PointConstraints(*point_constraints(operator, stiffness, wanted[:, None] * normal))
 
 
 def _patch_forces(scene: Thorax, u: Array) -> Array:
@@ -283,7 +283,7 @@ def _walls(bodies: Sequence[TetMesh], starts: Array, lung: TetMesh, points: Arra
 
 
 def _anchors(bodies: Sequence[TetMesh], starts: Array, points: Array, pair: Lung, towards: float) -> csr_matrix:
-    """Springs that hold the chest, firmly at its back, and the far side of what is below."""
+    """Constraints that hold the chest, firmly at its back, and the far side of what is below."""
     held = np.zeros(len(points))
     chest, below = bodies
     lung, side = pair.expired, pair.side

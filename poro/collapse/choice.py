@@ -10,7 +10,7 @@ import numpy as np
 from poro.arrays import Array
 from poro.collapse.finite_strain import FiniteProblem, FiniteState, FiniteStatus, WallContact, deform
 from poro.collapse.model import PoroSystem, Theta
-from poro.collapse.solution import PoroState, PoroStatus, solve
+from poro.collapse.solution import PoroState, PoroStatus
 from poro.fem.constitutive import ConstitutiveModel
 from poro.fem.forms import body_load, deformation_gradient
 from poro.fem.tissue import GRAVITY_KPA_PER_MM
@@ -58,13 +58,6 @@ def finite_problem(system: PoroSystem, theta: Theta, material: ConstitutiveModel
     pressure_drop = tissue.biot * (tissue.pleural_kpa - p[system.mesh.tets].mean(axis=1))
     contact = WallContact(system.wall, system.contact_nodes, theta.d_diaph_mm)
     return FiniteProblem(system.mesh, material, system.hilum, system.hilum_displacement, weight, contact, pressure_drop)
-
-
-def solve_in_range(
-    system: PoroSystem, theta: Theta, material: ConstitutiveModel, within: LinearRange | None = None
-) -> StrainChoice:
-    """Solve linearly, and again with `material` at finite strain when the linear answer leaves its range."""
-    return keep_in_range(system, solve(system, theta), material, within)
 
 
 def keep_in_range(

@@ -1,6 +1,6 @@
-"""Isotropic hyperelastic laws of the breathing papers, written in principal stretches: Ogden, Veronda-Westmann, Eom's.
+"""Isotropic hyperelastic models of the breathing papers in principal stretches: Ogden, Veronda-Westmann, Eom's.
 
-A law gives its energy and two derivatives by the principal stretches; stress and moduli follow from the singular value
+A strain energy comes with two derivatives by the principal stretches; stress and moduli follow from the singular value
 decomposition of F, of which a change turns the axes as well as it stretches along them.
 Ref: Ogden 1984, section 6.1; Smith, de Goes and Kim 2019 (moduli in the basis of the singular vectors).
 """
@@ -15,21 +15,21 @@ from poro.arrays import Array
 from poro.fem.constitutive import ConstitutiveModel
 from poro.fem.tissue import Tissue
 
-Law = Callable[[Array], tuple[Array, Array, Array]]
+StrainEnergy = Callable[[Array], tuple[Array, Array, Array]]
 """Principal stretches (m, 3) > 0 -> energy density (m,) kPa, its gradient (m, 3) and its Hessian (m, 3, 3)."""
 
 _EQUAL = 1e-6
 """Stretches nearer than this are taken for equal, where a quotient of differences becomes a derivative."""
 
 
-def isotropic(name: str, law: Law) -> ConstitutiveModel:
-    """Constitutive model of a law in principal stretches. Inverted elements have infinite energy."""
+def isotropic(name: str, energy_of: StrainEnergy) -> ConstitutiveModel:
+    """Constitutive model of a strain energy in principal stretches. Inverted elements have infinite energy."""
 
     def respond(f: Array) -> tuple[Array, Array, Array]:
         if not (np.linalg.det(f) > 0).all():
             return np.full(len(f), np.inf), np.zeros_like(f), np.zeros((len(f), 3, 3, 3, 3))
         u, stretch, vt = np.linalg.svd(f)
-        energy, slope, curvature = law(stretch)
+        energy, slope, curvature = energy_of(stretch)
         stress = np.einsum("mia,ma,maj->mij", u, slope, vt)
         moduli = np.zeros((len(f), 3, 3, 3, 3))
         for a in range(3):
@@ -58,17 +58,17 @@ def ogden(mu_kpa: float, alpha: float, bulk_kpa: float) -> ConstitutiveModel:
     Ref: Li & Porikli 2014, eq. 3.
     """
 
-    def law(logs: Array) -> tuple[Array, Array, Array]:
+    def energy_of(logs: Array) -> tuple[Array, Array, Array]:
         total, first, second = _power_sum(logs, alpha)
         swelling = logs.sum(axis=1)
         energy = mu_kpa / alpha * (total - 3) + bulk_kpa / 2 * swelling**2
         return energy, mu_kpa / alpha * first + (bulk_kpa * swelling)[:, None], mu_kpa / alpha * second + bulk_kpa
 
-    return isotropic("Ogden", _of_logarithms(law))
+    return isotropic("Ogden", _of_logarithms(energy_of))
 
 
 def ogden_lung(tissue: Tissue, alpha: float = 6.82) -> ConstitutiveModel:
-    """Ogden's law with the paper's exponent and a lung's own moduli at small strain.
+    """Ogden's model with the paper's exponent and a lung's own moduli at small strain.
 
     The paper's mu = 0.0329 comes without a unit and its bulk modulus without a value ("sufficiently high", which would
     keep a lung from filling), so both are those of `tissue` here. Ref: Li & Porikli 2014, section 3.3.
@@ -83,7 +83,7 @@ def veronda_westmann(tissue: Tissue, exponent: float = 1.0) -> ConstitutiveModel
     """
     bulk, shear = tissue.lame_kpa + 2 * tissue.shear_kpa / 3, tissue.shear_kpa
 
-    def law(logs: Array) -> tuple[Array, Array, Array]:
+    def energy_of(logs: Array) -> tuple[Array, Array, Array]:
         one, one_slope, one_curve = _power_sum(logs, 2.0)
         two, two_slope, two_curve = _power_sum(logs, -2.0)
         swelling = logs.sum(axis=1)
@@ -94,7 +94,7 @@ def veronda_westmann(tissue: Tissue, exponent: float = 1.0) -> ConstitutiveModel
         curve = shear * growth[:, None, None] * (one_curve + exponent * pairs) - shear / 2 * two_curve + bulk
         return energy, slope, curve
 
-    return isotropic("Veronda-Westmann", _of_logarithms(law))
+    return isotropic("Veronda-Westmann", _of_logarithms(energy_of))
 
 
 def eom_lung(modulus_kpa: float = 2.5, a: float = 0.433, b: float = -0.611) -> ConstitutiveModel:
@@ -105,7 +105,7 @@ def eom_lung(modulus_kpa: float = 2.5, a: float = 0.433, b: float = -0.611) -> C
     mu = -xi b / 4, 0.32 and 0.38 kPa. Ref: Eom 2010, section II B; Zeng, Yager & Fung 1987; Tawhai 2009, eq. 1.
     """
 
-    def law(stretch: Array) -> tuple[Array, Array, Array]:
+    def energy_of(stretch: Array) -> tuple[Array, Array, Array]:
         e = (stretch**2 - 1) / 2
         one = e.sum(axis=1)
         two = (one**2 - (e**2).sum(axis=1)) / 2
@@ -117,14 +117,14 @@ def eom_lung(modulus_kpa: float = 2.5, a: float = 0.433, b: float = -0.611) -> C
         curvature = curvature * stretch[:, :, None] * stretch[:, None, :] + by_strain[:, :, None] * np.eye(3)
         return growth - modulus_kpa / 2, by_strain * stretch, curvature
 
-    return isotropic("Eom", law)
+    return isotropic("Eom", energy_of)
 
 
-def _of_logarithms(law: Law) -> Law:
-    """Law in principal stretches of one in their logarithms."""
+def _of_logarithms(energy_of: StrainEnergy) -> StrainEnergy:
+    """Strain energy in principal stretches of one in their logarithms."""
 
     def by_stretch(stretch: Array) -> tuple[Array, Array, Array]:
-        energy, slope, curve = law(np.log(stretch))
+        energy, slope, curve = energy_of(np.log(stretch))
         curve = curve - slope[:, :, None] * np.eye(3)
         return energy, slope / stretch, curve / (stretch[:, :, None] * stretch[:, None, :])
 

@@ -1,4 +1,4 @@
-"""Trees obey their law of radii, and tubes fill their volume."""
+"""Radii of trees branch as they should, and tubes fill their volume."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Lungs filled to a volume: closed-form suction, the cavity, the pressure-volume curve, one scan."""
+"""Lungs filled to a volume: closed-form pressure, the cavity, the pressure-volume curve, one scan."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from scipy.sparse import diags
 
 from poro.breathing.cavity import inflating
 from poro.breathing.elastic import WALL_ALONE, Lung
-from poro.breathing.equilibrium import Balance, Scene, Springs, balance, volume
+from poro.breathing.equilibrium import Balance, PointConstraints, Scene, balance, volume
 from poro.breathing.inflation import fill, fill_to
 from poro.breathing.one_scan import one_scan, regions
 from poro.breathing.pressure_volume import PER_PA, inspired_volume, pressure_volume
@@ -20,31 +20,31 @@ from poro.mesh import TetMesh
 TISSUE = Tissue()
 
 
-def free_scene(mesh: TetMesh, suction_kpa: float = 0.0) -> Scene:
+def free_scene(mesh: TetMesh, transpulmonary_kpa: float = 0.0) -> Scene:
     anchor = diags(np.full(3 * len(mesh.points), 1e-7)).tocsr()
-    return Scene(mesh, neo_hookean(TISSUE), Springs(anchor, np.zeros_like(mesh.points)), suction_kpa)
+    return Scene(mesh, neo_hookean(TISSUE), PointConstraints(anchor, np.zeros_like(mesh.points)), transpulmonary_kpa)
 
 
-def suction(s: float) -> float:
+def pressure(s: float) -> float:
     """Of a neo-Hookean body that swells freely by s: mu (s^2 - 1) / s^3 + 3 lambda ln s / s^3."""
     return (TISSUE.shear_kpa * (s**2 - 1) + 3 * TISSUE.lame_kpa * np.log(s)) / s**3
 
 
 @pytest.mark.parametrize("s", [0.9, 1.12])
-def test_a_free_lung_swells_evenly_under_its_closed_form_suction(s: float) -> None:
+def test_a_free_lung_swells_evenly_under_its_closed_form_pressure(s: float) -> None:
     mesh = pear()
     found = fill_to(free_scene(mesh), s**3 * float(mesh.volumes.sum()), (s - 1) * mesh.points * 0.5)
     reached = np.cbrt(found.volume_mm3 / mesh.volumes.sum())
     assert reached == pytest.approx(s, abs=0.01)
-    assert (found.suction_kpa > 0) == (s > 1)
-    assert found.suction_kpa == pytest.approx(suction(reached), rel=0.02)
+    assert (found.transpulmonary_kpa > 0) == (s > 1)
+    assert found.transpulmonary_kpa == pytest.approx(pressure(reached), rel=0.02)
     shift = found.u - (reached - 1) * mesh.points
     assert_allclose(shift - shift.mean(axis=0), 0, atol=0.1)
 
 
-def test_balance_under_a_given_suction_is_the_same_swelling() -> None:
+def test_balance_under_a_given_pressure_is_the_same_swelling() -> None:
     mesh, s = pear(), 1.1
-    found = balance(free_scene(mesh, suction(s)), (s - 1) * mesh.points * 0.9, tolerance=1e-7)
+    found = balance(free_scene(mesh, pressure(s)), (s - 1) * mesh.points * 0.9, tolerance=1e-7)
     assert found.balance is Balance.BALANCED
     assert volume(mesh, found.u) / mesh.volumes.sum() == pytest.approx(s**3, rel=1e-4)
     assert found.residuals[-1] < 1e-7
@@ -58,7 +58,7 @@ def test_a_lung_fills_its_cavity_and_stays_within() -> None:
         assert phase.volume_mm3 == pytest.approx(scene.volume(share), rel=0.02)
     wall = scene.cavity.level.evaluate(expired.points + phases[-1].u)[0]
     assert wall.min() > -3.0
-    assert phases[1].suction_kpa > phases[0].suction_kpa > 0
+    assert phases[1].transpulmonary_kpa > phases[0].transpulmonary_kpa > 0
     top, bottom = expired.points[:, 2] > 40, expired.points[:, 2] < -20
     assert phases[-1].u[top, 2].mean() > 2 > -2 > phases[-1].u[bottom, 2].mean()
 
@@ -102,4 +102,4 @@ def test_a_breath_of_one_scan_lowers_the_diaphragm_and_keeps_the_apex() -> None:
     down = filled.u[nodes[scene.regions.diaphragm], 2].mean()
     assert down < -1
     assert emptied.u[nodes[scene.regions.diaphragm], 2].mean() > 1
-    assert filled.suction_kpa > 0 > emptied.suction_kpa
+    assert filled.transpulmonary_kpa > 0 > emptied.transpulmonary_kpa

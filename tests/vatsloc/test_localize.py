@@ -46,7 +46,7 @@ def case(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def blind_case(case: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def bare_case(case: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same case with nonsense for landmarks and truth: who reads them stumbles."""
     folder = tmp_path_factory.mktemp("training_only") / "demo"
     shutil.copytree(case, folder)
@@ -69,11 +69,11 @@ class OpenedFiles:
 
 
 @pytest.fixture(scope="module")
-def watched(blind_case: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, OpenedFiles]:
+def watched(bare_case: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, OpenedFiles]:
     """The result of a run, and the files that it opened."""
     folder = tmp_path_factory.mktemp("result") / "demo"
     opened = OpenedFiles()
-    run_case(blind_case, folder, load_settings("fast", None))
+    run_case(bare_case, folder, load_settings("fast", None))
     opened.on = False
     return folder, opened
 
@@ -92,11 +92,9 @@ def test_every_output_is_there(result: Path) -> None:
     assert sorted(path.name for path in result.iterdir()) == sorted(OUTPUT_FILES)
 
 
-def test_of_the_case_only_what_it_names_for_a_run_is_opened(
-    blind_case: Path, watched: tuple[Path, OpenedFiles]
-) -> None:
+def test_of_the_case_only_what_it_names_for_a_run_is_opened(bare_case: Path, watched: tuple[Path, OpenedFiles]) -> None:
     """Neither landmarks nor truth; `test_a_second_run_...` shows that without them all is the same byte for byte."""
-    of_case = {Path(name).relative_to(blind_case) for name in watched[1].names if Path(name).is_relative_to(blind_case)}
+    of_case = {Path(name).relative_to(bare_case) for name in watched[1].names if Path(name).is_relative_to(bare_case)}
     named = {"ct.nii.gz", "cbct_inflated.nii.gz", "cbct_deflated.nii.gz", "nodule.nii.gz"}
     assert {path.as_posix() for path in of_case} == {"case.toml", *named}
 
@@ -233,10 +231,10 @@ def test_a_second_run_without_landmarks_and_truth_writes_the_same(case: Path, re
     assert {k: v for k, v in here.items() if k not in TIMED} == {k: v for k, v in there.items() if k not in TIMED}
 
 
-def test_a_killed_run_leaves_no_result(blind_case: Path, tmp_path: Path) -> None:
+def test_a_killed_run_leaves_no_result(bare_case: Path, tmp_path: Path) -> None:
     """Killed while it works; `test_formats_folder` kills the writing of results at many moments."""
     out = tmp_path / "out"
-    command = [sys.executable, "-m", "vatsloc", "localize", str(blind_case), "--out", str(out), "--preset", "fast"]
+    command = [sys.executable, "-m", "vatsloc", "localize", str(bare_case), "--out", str(out), "--preset", "fast"]
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as process:
         assert process.stderr is not None
         assert any("CT lungs ..." in line for line in process.stderr)

@@ -56,7 +56,7 @@ def drive(case: BreathCase, count: int, say: Callable[[str], None]) -> Motion:
         knots = np.linspace(0, 1, KNOTS)
         settled = scene.states([rest * (1 + k * (full / start - 1)) for k in knots[1:]])
         u = np.stack([np.zeros_like(mesh.points), *(s.u for s in settled)])
-        p = np.array([0.0, *(1000 * s.suction_kpa for s in settled)])
+        p = np.array([0.0, *(1000 * s.transpulmonary_kpa for s in settled)])
         lag = _lag(scene, rest * (1 + (full / start - 1) / 2), case.hysteresis)
         states = tuple(
             mesh.points + between(u, knots, s) + d * 4 * s * (1 - s) * lag

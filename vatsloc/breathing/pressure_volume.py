@@ -1,7 +1,7 @@
 """Driver `pressure-volume`: the expired lung is inflated inside the inspired cavity, phase by phase. Ref: Eom 2010.
 
-The suction follows the volume: at every phase the lung has the phase's volume, and its tissue's stiffness is set by one
-number, so that at the end of inspiration the suction is what the pressure-volume curve says.
+The pressure follows the volume: at every phase the lung has the phase's volume, and its tissue's stiffness is set by
+one number, so that at the end of inspiration the pressure is what the pressure-volume curve says.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ EQUILIBRIA = 5
 """How many are computed; phases between lie on a line from one to the next."""
 FULL = 0.99
 """Share of the way to the inspired volume at which the lung stops: corners of the cavity it would only fill at any
-suction."""
+pressure."""
 
 
 def drive(case: BreathCase, count: int, say: Callable[[str], None]) -> Motion:
@@ -35,7 +35,7 @@ def drive(case: BreathCase, count: int, say: Callable[[str], None]) -> Motion:
     pairs, notes = both_scans(case, EDGE_MM)
     progress = shares(count)
     knots = shares(min(count, EQUILIBRIA + 1))
-    lungs, suctions, quality = [], [], []
+    lungs, pressures, quality = [], [], []
     for pair in pairs:
         say(f"{pair.side} lung: {len(knots) - 1} equilibria of its inflation ...")
         scene = inflating(pair.lung, acting_at(pair.depth))
@@ -43,12 +43,12 @@ def drive(case: BreathCase, count: int, say: Callable[[str], None]) -> Motion:
         u = np.stack([np.zeros_like(scene.mesh.points), *(phase.u for phase in found)])
         states = tuple(scene.mesh.points + between(u, knots, s) for s in progress)
         lungs.append(LungMotion(pair.side, scene.mesh, states))
-        suctions.append(np.interp(progress, knots, [0.0, *(1000 * phase.suction_kpa for phase in found)]))
+        pressures.append(np.interp(progress, knots, [0.0, *(1000 * phase.transpulmonary_kpa for phase in found)]))
         quality.append((pair.side, violations(scene.mesh), violations(smooth(scene.mesh))))
         if not all(phase.settled for phase in found):
             slow = sum(not phase.settled for phase in found)
             notes.append(f"{pair.side} lung: {slow} of {len(knots) - 1} equilibria still moved by over 0.3 mm a step.")
-    by_tissue = np.mean(suctions, axis=0)
+    by_tissue = np.mean(pressures, axis=0)
     volumes = np.array([sum(lung.volume_ml(n) for lung in lungs) for n in range(count)])
     curve = pressure_volume(volumes - volumes[0], volumes[0])
     stiffness = float(curve[-1] / by_tissue[-1]) if by_tissue[-1] > 0 else 1.0
