@@ -226,7 +226,7 @@ def test_sensitivity_of_contact_equals_finite_differences(hollow: tuple) -> None
         assert_allclose(change[:, :, k], difference, atol=2e-4 * np.abs(difference).max())
 
 
-def test_nodes_that_the_diaphragm_lets_behind_the_cage_are_counted_and_the_hilum_is_left_out() -> None:
+def test_nodes_that_the_diaphragm_lets_behind_the_wall_are_counted_and_the_hilum_is_left_out() -> None:
     """A diaphragm that sinks under a heavy lung takes its nodes along, out of the chest wall."""
     mesh = ellipsoid(15.0)
     held = np.flatnonzero(np.linalg.norm(mesh.points - [-30, 0, 0], axis=1) < 16)

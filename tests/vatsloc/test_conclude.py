@@ -188,7 +188,7 @@ def test_a_parameter_at_its_bound_is_named(theta: Theta, named: str) -> None:
     assert warning.startswith(f"The fit ended at a bound of {named}:")
 
 
-def test_nodes_behind_the_cage_are_counted() -> None:
+def test_nodes_behind_the_wall_are_counted() -> None:
     state = replace(known.scene().collapse.fit.state, conflicts=3)
     (warning,) = warnings_of(complete().with_fit(state=state))
-    assert warning.startswith("3 nodes were pushed behind the cage")
+    assert warning.startswith("3 nodes were pushed behind the chest wall")

@@ -29,12 +29,12 @@ def test_depth_below_a_surface_is_signed_and_names_the_nearest_point():
 
 
 def test_nearest_edge_comes_first_and_those_at_the_wall_are_not_visible():
-    # The lung fell 20 mm from the front and 12 mm from below; behind and above it still touches its cage.
+    # The lung fell 20 mm from the front and 12 mm from below; behind and above it still touches the wall.
     tips = np.array([[40.0, 0, 0], [-40, 0, 0], [0, 50, 0], [0, -50, 0], [0, 0, 60], [0, 0, -60]])
     lung = Surface(tips, np.array([[a, b, c] for a in (0, 1) for b in (2, 3) for c in (4, 5)]))
-    cage = box([-50, -50, -72], [50, 70, 60])
+    wall = box([-50, -50, -72], [50, 70, 60])
     foot = np.array([20.0, 25, 0])
-    marks = {mark.name: mark for mark in surface_landmarks(lung, cage, foot)}
+    marks = {mark.name: mark for mark in surface_landmarks(lung, wall, foot)}
     assert_allclose(marks["anterior edge at that height"].at_ras, [0, 50, 0])
     seen = {name for name, mark in marks.items() if mark.visible}
     assert seen == {"anterior edge at that height", "lowest edge"}

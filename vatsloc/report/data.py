@@ -78,13 +78,13 @@ class Picture:
 @dataclass(frozen=True)
 class Motion:
     """The collapse, in the deflated CBCT's frame, RAS mm. triangles: (m, 3), outward; before, after: (n, 3) the lung's
-    surface; cage: what it may not pass; nodule_before: (3,).
+    surface; wall: what it may not pass; nodule_before: (3,).
     """
 
     triangles: Array
     before: Array
     after: Array
-    cage: Surface
+    wall: Surface
     nodule_before: Array
 
 

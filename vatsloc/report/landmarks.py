@@ -11,7 +11,7 @@ from vatsloc.report.data import Landmark
 from vatsloc.report.words import WORDS
 
 GAS_MM = 5.0
-"""Pleural gas between lung and cage that makes a place visible."""
+"""Pleural gas between lung and chest wall that makes a place visible."""
 
 BAND_MM = 6.0
 """Half height of the band in which an edge counts as level with the nodule."""
@@ -28,7 +28,7 @@ def depth_below(surface: Surface, point_ras: Array) -> tuple[float | None, Array
     return -float(near.distance[0]), near.points[0]
 
 
-def surface_landmarks(lung: Surface, cage: Surface, foot_ras: Array) -> tuple[Landmark, ...]:
+def surface_landmarks(lung: Surface, wall: Surface, foot_ras: Array) -> tuple[Landmark, ...]:
     """Apex, lowest edge, and the edges in front and behind level with `foot_ras` (3,), nearest to it first."""
     points = lung.points_ras
     level = points[np.abs(points[:, 2] - foot_ras[2]) < BAND_MM]
@@ -39,7 +39,7 @@ def surface_landmarks(lung: Surface, cage: Surface, foot_ras: Array) -> tuple[La
         WORDS["anterior"]: level[level[:, 1].argmax()],
         WORDS["posterior"]: level[level[:, 1].argmin()],
     }
-    gas_mm = np.abs(closest_points(_tri(cage), np.array(list(at.values()))).distance)
+    gas_mm = np.abs(closest_points(_tri(wall), np.array(list(at.values()))).distance)
     marks = [
         Landmark(name, p, float(np.linalg.norm(p - foot_ras)), bool(gas > GAS_MM))
         for (name, p), gas in zip(at.items(), gas_mm, strict=True)

@@ -3,18 +3,18 @@
 const STEPS = 2, FINEST = 120000; // subdivisions at most, triangles at most
 function lung3d(canvas, scene) {
   const pen = canvas.getContext("2d");
-  const { cage, nodule } = scene;
+  const { wall: border, nodule } = scene;
   // The mesh is coarse, its rim a polygon: a smooth surface is drawn through it.
   const { triangles, values: [before, after] } = smooth(scene.triangles, [scene.before, scene.after]);
   const now = new Float32Array(before.length);
-  const lung = mesh(now, triangles), wall = mesh(cage.points, cage.triangles), ball = sphere();
+  const lung = mesh(now, triangles), wall = mesh(border.points, border.triangles), ball = sphere();
   const ORANGE = [230, 159, 0], YELLOW = [240, 228, 66], BLUE = [86, 180, 233], GREY = [190, 200, 215];
   const BALL = [[4, 0, 0], [0, 4, 0], [0, 0, 4]];
   const middle = [0, 0, 0];
   let low = [1e9, 1e9, 1e9], high = [-1e9, -1e9, -1e9];
-  for (let n = 0; n < cage.points.length; n++) {
-    low[n % 3] = Math.min(low[n % 3], cage.points[n]);
-    high[n % 3] = Math.max(high[n % 3], cage.points[n]);
+  for (let n = 0; n < border.points.length; n++) {
+    low[n % 3] = Math.min(low[n % 3], border.points[n]);
+    high[n % 3] = Math.max(high[n % 3], border.points[n]);
   }
   for (let a = 0; a < 3; a++) middle[a] = (low[a] + high[a]) / 2;
   const radius = Math.hypot(...middle.map((m, a) => high[a] - m));

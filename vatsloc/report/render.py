@@ -108,7 +108,7 @@ def render(data: ReportData) -> str:
         memory_chart=bars(memory, "MB", WORDS["memory_alt"]) if memory else None,
         rest={k: json.dumps(v, indent=1, default=str) for k, v in data.run.items() if k not in _SHOWN},
         skipped={name: why for name, why in data.run.get("skipped", {}).items() if name not in chosen},
-        colours={"nodule": NODULE, "lung": LUNG, "cage": MESH, "inflated": SURFACE},
+        colours={"nodule": NODULE, "lung": LUNG, "wall": MESH, "inflated": SURFACE},
         paper_warnings=PAPER_WARNINGS,
         scores_from=Markup(SCORES_FROM),
         scores_to=Markup(SCORES_TO),

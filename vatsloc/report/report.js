@@ -20,7 +20,7 @@
     const surface = (s) => ({ ...s, points: new Float32Array(bytes(s.points)), triangles: new Uint32Array(bytes(s.triangles)) });
     if (data.motion) {
       const { points, triangles } = surface({ points: data.motion.after, triangles: data.motion.triangles });
-      data.motion = { triangles, after: points, before: new Float32Array(bytes(data.motion.before)), cage: surface(data.motion.cage) };
+      data.motion = { triangles, after: points, before: new Float32Array(bytes(data.motion.before)), wall: surface(data.motion.wall) };
     }
     return data;
   }
@@ -59,11 +59,11 @@
     const zoom = lines.width / stack.columns, share = state.deform / 100;
     pen.lineWidth = Math.max(1.5, lines.width / 260);
     if (scene.motion) {
-      const { before, after, triangles, cage } = scene.motion;
+      const { before, after, triangles, wall } = scene.motion;
       const now = new Float32Array(before.length);
       for (let n = 0; n < now.length; n++) now[n] = before[n] + share * (after[n] - before[n]);
       pen.setLineDash([6, 5]);
-      section(part, pen, cage.points, cage.triangles, scene.colours.cage);
+      section(part, pen, wall.points, wall.triangles, scene.colours.wall);
       pen.setLineDash([]);
       section(part, pen, now, triangles, scene.colours.lung);
     }

@@ -25,7 +25,7 @@ def scene(data: ReportData, stacks: Sequence[Stack]) -> dict[str, Any]:
     motion, nodule = data.motion, data.nodule
     return {
         "stacks": [stack.as_json() for stack in stacks],
-        "colours": {"nodule": NODULE, "lung": LUNG, "cage": MESH},
+        "colours": {"nodule": NODULE, "lung": LUNG, "wall": MESH},
         "look": {"turn": LOOK_DEGREES.get(str(data.run.get("side")), 0.0), "tilt": TILT_DEGREES},
         "motion": None
         if motion is None
@@ -33,7 +33,7 @@ def scene(data: ReportData, stacks: Sequence[Stack]) -> dict[str, Any]:
             "triangles": _packed(motion.triangles, "<u4"),
             "before": _packed(motion.before, "<f4"),
             "after": _packed(motion.after, "<f4"),
-            "cage": _surface(motion.cage),
+            "wall": _surface(motion.wall),
         },
         "nodule": {
             "before": None if motion is None else _rounded(motion.nodule_before),

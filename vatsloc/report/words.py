@@ -71,7 +71,7 @@ WORDS: Mapping[str, str] = {
     "kept": "kept",
     "left_out": "left out",
     # in three dimensions
-    "space": "The lung, its cage and the nodule before and after the collapse. Arrow keys turn the view.",
+    "space": "The lung, the chest wall and the nodule before and after the collapse. Arrow keys turn the view.",
     "inflated": "inflated",
     "deflated": "deflated",
     "deform": "deformation from the inflated to the deflated lung",
@@ -84,7 +84,7 @@ WORDS: Mapping[str, str] = {
     "key_nodule": "nodule now, 95 % ellipsoid where larger",
     "key_before": "nodule before the collapse",
     "key_lung": "lung",
-    "key_cage": "cage",
+    "key_wall": "chest wall",
     "mark_nodule": "nodule",
     "mark_inflated": "inflated",
     "moved_to": "{mm:.0f} to the {way}",
@@ -105,7 +105,7 @@ WORDS: Mapping[str, str] = {
     "key_ellipsoid": "nodule, 95 %",
     "slice_of": "{plane} slice of {image}",
     "slice_over": "{plane} slice of {image}, blended over it",
-    "lines": "outlines of the nodule, the lung and the cage",
+    "lines": "outlines of the nodule, the lung and the chest wall",
     "slice_slider": "{plane} slice",
     "viewer_help": (
         "Arrow keys move a focused slider by one slice, the wheel does so over a picture. A click in a picture brings "

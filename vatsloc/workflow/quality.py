@@ -124,7 +124,7 @@ def warn_of_doubts(pose: ChangeOfPose, collapse: Collapse, stages: Stages) -> No
     if held:
         stages.warn(f"The fit ended at a bound of {' and '.join(held)}: the model makes up there for what it lacks.")
     if np.any(collapse.fit.state.conflicts):
-        stages.warn(f"{collapse.fit.state.conflicts} nodes were pushed behind the cage by the diaphragm.")
+        stages.warn(f"{collapse.fit.state.conflicts} nodes were pushed behind the chest wall by the diaphragm.")
 
 
 def spine_gates(inflated: RigidFit | None, deflated: RigidFit, limits: GateSettings) -> dict[str, Gate]:

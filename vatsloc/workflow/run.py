@@ -116,7 +116,7 @@ def _result(case: Case, found: Localization, fields: Fields, run: RunRecord) -> 
     det_f = signed_volumes(after.points, after.tets) / before.volumes
     pressure, contact = collapse.on_lung(np.column_stack([state.p, state.contact_pressure])).T
     none = np.zeros(len(pressure))
-    outer, cage = after.boundary, contact_surface(collapse)
+    outer, wall = after.boundary, contact_surface(collapse)
     pose_det = pose.mesh_inf.volumes / pose.mesh_ct.volumes
     return ResultData(
         nodule_inflated_ras=found.nodule_inf,
@@ -130,7 +130,7 @@ def _result(case: Case, found: Localization, fields: Fields, run: RunRecord) -> 
         lung_inflated=_tetra(pose.mesh_inf, pose.points_inf - pose.mesh_ct.points, none, pose_det, none),
         lung_deflated=_with_radius95(found, _tetra(after, after.points - pose.points_inf, pressure, det_f, contact)),
         deflated_surface=Surface(outer.points, outer.triangles),
-        contact_surface=Surface(cage.points, cage.triangles),
+        contact_surface=Surface(wall.points, wall.triangles),
         inflated_from_ct=fields.inflated_from_ct,
         deflated_from_ct=fields.deflated_from_ct,
         ct_from_inflated=fields.ct_from_inflated,
