@@ -68,6 +68,7 @@ SCOPE: Scope = {
     "vatsloc/workflow/stages.py": None,  # seconds, memory and messages
 }
 DEMO = "tests/vatsloc/test_localize.py"
+WHOLE_RUNS = (DEMO, "tests/vatsloc/test_state.py", "tests/vatsloc/test_two_scans.py")  # minutes for each mutant
 DEMO_WORDS = ("-k", "not killed and not change_nothing")  # these run the demo again and judge how files are handled
 STEPS = 2  # a test judges what it imports, and what that imports
 MOST = 12  # test files for one mutant; a number, since seconds would let a busy machine choose
@@ -101,7 +102,7 @@ def in_scope(root: Path, scope: Scope) -> Scope:
 def within_reach(imports: Imports, file: str) -> dict[str, int]:
     """Test files that import a module in few steps, or else those that need the fewest."""
     tests = [test for test in imports.trees if test.startswith("tests/") and Path(test).name.startswith("test_")]
-    steps = {test: imports.reached(test).get(file) for test in tests if test != DEMO}
+    steps = {test: imports.reached(test).get(file) for test in tests if test not in WHOLE_RUNS}
     found = {test: step for test, step in steps.items() if step is not None}
     limit = max(STEPS, min(found.values(), default=STEPS))
     return {test: step for test, step in found.items() if step <= limit}

@@ -12,17 +12,15 @@ import pytest
 
 from phantoms.spec import SPECS
 from registration.volume import Volume
+from tests import made_once
 from vatsloc.cli import main
 from vatsloc.formats.images import read_volume
 from vatsloc.formats.nifti import write_volume
-from vatsloc.synthetic.case import write_phantom
 
 
 @pytest.fixture(scope="module")
 def phantom(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("cli") / "demo"
-    write_phantom("demo", folder)
-    return folder
+    return made_once.demo_case(tmp_path_factory)
 
 
 @pytest.fixture

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +11,11 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from tests import made_once
 from vatsloc.errors import CaseError
 from vatsloc.evaluation.ellipsoid import in_ellipsoid
 from vatsloc.formats.markups import read_points
 from vatsloc.study import forecast as study
-from vatsloc.synthetic.case import write_phantom
 from vatsloc.workflow.forecast import Motions, calibrated_motions, calibration, forecast, mean_motion, motions_of
 from vatsloc.workflow.foresee import foresee_case
 
@@ -130,8 +131,7 @@ def test_drawn_operations_lie_between_the_suite_s_and_are_the_same_again() -> No
 @pytest.fixture(scope="module")
 def case(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A case of which only the CT is there."""
-    folder = tmp_path_factory.mktemp("foresee") / "demo"
-    write_phantom("demo", folder)
+    folder = Path(shutil.copytree(made_once.demo_case(tmp_path_factory), tmp_path_factory.mktemp("foresee") / "demo"))
     for path in (*folder.glob("cbct_*"), *folder.glob("landmarks_*"), *folder.glob("truth/*")):
         path.unlink()
     return folder

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import shutil
 import signal
 import subprocess
@@ -18,6 +17,7 @@ import pytest
 from poro.fem import Tissue
 from poro.mesh import TetMesh
 from registration.maps.rigid import RigidTransform
+from tests import made_once
 from vatsloc.case import read_case
 from vatsloc.evaluation import evaluate_case
 from vatsloc.formats.fields import read_field
@@ -27,7 +27,6 @@ from vatsloc.formats.meshes import read_vtu
 from vatsloc.formats.transforms import read_tfm
 from vatsloc.maps import MeshMap, covered
 from vatsloc.results import OUTPUT_FILES
-from vatsloc.synthetic.case import write_phantom
 from vatsloc.workflow.run import run_case
 from vatsloc.workflow.settings import load_settings
 
@@ -40,47 +39,23 @@ NODULE_INFLATED_MM, NODULE_DEFLATED_MM = 0.25, 0.30
 
 @pytest.fixture(scope="module")
 def case(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("phantom") / "demo"
-    write_phantom("demo", folder)
-    return folder
+    return made_once.demo_case(tmp_path_factory)
 
 
 @pytest.fixture(scope="module")
-def bare_case(case: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The same case with nonsense for landmarks and truth: who reads them stumbles."""
-    folder = tmp_path_factory.mktemp("training_only") / "demo"
-    shutil.copytree(case, folder)
-    for path in (*folder.glob("landmarks_*"), *folder.glob("truth/*")):
-        path.write_bytes(b"nonsense")
-    return folder
-
-
-class OpenedFiles:
-    """Names of the files that Python opens while `on`. Python keeps an audit hook until it ends."""
-
-    def __init__(self) -> None:
-        self.names: set[str] = set()
-        self.on = True
-        sys.addaudithook(self._note)
-
-    def _note(self, event: str, arguments: tuple[Any, ...]) -> None:
-        if self.on and event == "open" and isinstance(arguments[0], str | bytes):
-            self.names.add(os.fsdecode(arguments[0]))
+def bare_case(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return made_once.bare_case(tmp_path_factory)
 
 
 @pytest.fixture(scope="module")
-def watched(bare_case: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, OpenedFiles]:
-    """The result of a run, and the files that it opened."""
-    folder = tmp_path_factory.mktemp("result") / "demo"
-    opened = OpenedFiles()
-    run_case(bare_case, folder, load_settings("fast", None))
-    opened.on = False
-    return folder, opened
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return made_once.demo_run(tmp_path_factory)
 
 
 @pytest.fixture(scope="module")
-def result(watched: tuple[Path, OpenedFiles]) -> Path:
-    return watched[0]
+def result(made: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What the run wrote; a copy, to which the evaluation adds its scores."""
+    return Path(shutil.copytree(made / "result", tmp_path_factory.mktemp("result") / "demo"))
 
 
 @pytest.fixture(scope="module")
@@ -92,9 +67,10 @@ def test_every_output_is_there(result: Path) -> None:
     assert sorted(path.name for path in result.iterdir()) == sorted(OUTPUT_FILES)
 
 
-def test_of_the_case_only_what_it_names_for_a_run_is_opened(bare_case: Path, watched: tuple[Path, OpenedFiles]) -> None:
+def test_of_the_case_only_what_it_names_for_a_run_is_opened(bare_case: Path, made: Path) -> None:
     """Neither landmarks nor truth; `test_a_second_run_...` shows that without them all is the same byte for byte."""
-    of_case = {Path(name).relative_to(bare_case) for name in watched[1].names if Path(name).is_relative_to(bare_case)}
+    opened = [Path(name) for name in json.loads((made / "opened.json").read_text(encoding="utf-8"))]
+    of_case = {path.relative_to(bare_case) for path in opened if path.is_relative_to(bare_case)}
     named = {"ct.nii.gz", "cbct_inflated.nii.gz", "cbct_deflated.nii.gz", "nodule.nii.gz"}
     assert {path.as_posix() for path in of_case} == {"case.toml", *named}
 

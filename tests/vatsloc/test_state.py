@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests import made_once
 from vatsloc.case import CaseBefore, read_case, read_case_before
 from vatsloc.errors import CaseError, InputRefused
 from vatsloc.results import OUTPUT_FILES
-from vatsloc.synthetic.case import write_phantom
 from vatsloc.workflow.pose import ChangeOfPose
 from vatsloc.workflow.prepare import PreparedBefore
 from vatsloc.workflow.run import run_case
@@ -22,14 +22,12 @@ from vatsloc.workflow.settings import Settings, load_settings, settings_of
 from vatsloc.workflow.state import key_of, prepare_case, read_state, write_state
 
 TIMED = {"seconds", "peak_mb", "peak_mb_by_stage"}
-FAST = load_settings("fast", None)
+FAST = load_settings(made_once.PRESET, None)
 
 
 @pytest.fixture(scope="module")
 def case(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("steps") / "demo"
-    write_phantom("demo", folder)
-    return folder
+    return made_once.bare_case(tmp_path_factory)
 
 
 @pytest.fixture(scope="module")
@@ -58,10 +56,9 @@ def contents(result: Path) -> dict[str, Any]:
 
 
 def test_a_run_from_either_state_is_the_plain_run_to_the_last_bit(
-    case: Path, states: tuple[Path, Path, list[str]], tmp_path: Path
+    case: Path, states: tuple[Path, Path, list[str]], tmp_path_factory: pytest.TempPathFactory, tmp_path: Path
 ) -> None:
-    run_case(case, tmp_path / "plain", FAST)
-    plain = contents(tmp_path / "plain")
+    plain = contents(made_once.demo_run(tmp_path_factory) / "result")
     for number, state in enumerate(states[:2]):
         said = list[str]()
         run_case(case, tmp_path / str(number), FAST, said.append, state)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -10,7 +11,9 @@ import pytest
 from numpy.testing import assert_allclose
 
 from registration.verification import LeftOver
-from vatsloc.study.stability.faults import FAULTS, LOBE_MM, LOBE_SHARE, beside_truth, page, score
+from vatsloc.study.bench import check as bench
+from vatsloc.study.bench.check import bench_check, beside_truth, table
+from vatsloc.study.stability.faults import FAULTS, LOBE_MM, LOBE_SHARE, page, score
 from vatsloc.workflow.check import Checks
 from vatsloc.workflow.gates import at_most
 
@@ -76,8 +79,36 @@ def test_what_is_left_stands_beside_the_true_error_of_its_own_part() -> None:
     assert one["left over"] == one["true error"] == "1.00 / 1.00"
     assert one["difference of both vectors"] == "0.00 / 0.00"
     assert (chain["left over"], chain["true error"]) == ("0.00 / 0.00", "3.00 / 3.00")
+    assert (one["medians apart"], chain["medians apart"]) == (0.0, 3.0)
     assert beside_truth(answer(checks=None), dense) == []
     assert beside_truth(answer(checks=Checks(*told)), None) == []
+
+
+def test_cases_are_run_and_their_check_compared_with_their_own_truth(monkeypatch: pytest.MonkeyPatch) -> None:
+    ct = np.random.default_rng(6).uniform(0, 50, (200, 3))
+    away = {"a": 0.4, "b": 2.0}  # of the chain's error, mm
+    dense = {
+        name: np.stack([ct, ct + np.array([5.0, 0, 0]), ct + np.array([10.0, mm, 0])], axis=1)
+        for name, mm in away.items()
+    }
+
+    def run(case: str, settings: str, _stages: Any) -> Any:
+        assert settings == "settings"
+        return answer(checks=Checks(None, LeftOver(dense[case][:50, 2], np.zeros((50, 3)), 60)))
+
+    monkeypatch.setattr(bench, "read_case", lambda folder: folder.name)
+    monkeypatch.setattr(bench, "localize", run)
+    monkeypatch.setattr(bench, "read_truth", lambda folder: SimpleNamespace(dense=dense.get(folder.name)))
+    folders = [Path(name) for name in away]
+    result = bench_check(folders, cast(Any, "settings"))
+    assert [(row["case"], row["part"], row["medians apart"]) for row in result["rows"]] == [
+        ("a", "chain", 0.4),
+        ("b", "chain", 2.0),
+    ]
+    assert result["agree"] == 1
+    assert "Medians agree within 0.5 mm in 1 of 2 rows." in table(result)
+    monkeypatch.setattr(bench, "read_truth", lambda _folder: SimpleNamespace(dense=None))
+    assert table(bench_check(folders[:1], cast(Any, "settings"))) == "No case has dense truth."
 
 
 def test_the_page_counts_noticed_silent_and_false_alarms() -> None:

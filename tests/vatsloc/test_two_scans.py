@@ -12,11 +12,11 @@ import pytest
 from numpy.testing import assert_allclose
 
 from registration.volume import Volume
+from tests import made_once
 from tests.vatsloc import run_scene as known
 from vatsloc.case import read_case
 from vatsloc.evaluation import evaluate_case
 from vatsloc.results import output_files
-from vatsloc.synthetic.case import write_phantom
 from vatsloc.workflow.run import run_case
 from vatsloc.workflow.settings import Settings, load_settings
 from vatsloc.workflow.stages import Stages
@@ -27,8 +27,7 @@ from vatsloc.workflow.state import before_collapse
 @pytest.fixture(scope="module")
 def case(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The demo without its inflated scan and without the landmarks in it."""
-    folder = tmp_path_factory.mktemp("two") / "demo"
-    write_phantom("demo", folder)
+    folder = Path(shutil.copytree(made_once.demo_case(tmp_path_factory), tmp_path_factory.mktemp("two") / "demo"))
     for path in (*folder.glob("*inflated*"), *folder.glob("truth/*inflated*")):
         path.unlink()
     lines = (folder / "case.toml").read_text(encoding="utf-8").splitlines()

@@ -96,6 +96,21 @@ def bench_forecast_command(
         show(result)
 
 
+@bench.command("check")
+def bench_check_command(
+    cases: Annotated[list[Path], typer.Argument(metavar="CASES...", help="Case folders with dense truth.")],
+    preset: PresetOption = "balanced",
+    out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="Markdown table to write.")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Whole run: what its check finds left over, beside the true error at the same places."""
+    from vatsloc.study.bench.check import bench_check, table
+    from vatsloc.workflow.settings import load_settings
+
+    result = bench_check(cases, load_settings(preset, None), say)
+    _report(result, table, table, out, as_json)
+
+
 @bench.command("cbct")
 def bench_cbct_command(
     name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the phantom.")] = "demo",

@@ -7,13 +7,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from registration.maps.rigid import RigidTransform
 from registration.volume import Array
 from vatsloc.case import Case, read_case
 from vatsloc.errors import VatslocError
 from vatsloc.evaluation.inputs import Truth
+from vatsloc.study.bench.check import BESIDE_TRUTH, beside_truth
 from vatsloc.study.stability.fit import Scene, direction, errors_mm, read_scene, slipped_spine
 from vatsloc.study.tables import Row, markdown
 from vatsloc.workflow.localization import Localization, checked, locate_nodule
@@ -65,47 +65,8 @@ def page(rows: list[Row], beside: list[Row]) -> str:
     )
     parts = ["# Does a run notice that it is wrong?", text, markdown(rows)]
     if beside:
-        told = (
-            "What the check finds left over in undisturbed runs, beside the true error at the same places (mean of the "
-            "four nearest points of dense truth, weighted by distance), median / 90 % in mm:"
-        )
-        parts += ["## What is left over, beside the truth", told, markdown(beside)]
+        parts += ["## What is left over, beside the truth", BESIDE_TRUTH, markdown(beside)]
     return "\n\n".join(parts) + "\n"
-
-
-def beside_truth(found: Localization, dense: Array | None) -> list[Row]:
-    """What the check of a run found left over, a row each for phase 1 and the chain, beside the true error there.
-
-    dense: (n, 3, 3) tissue points in CT, inflated and deflated CBCT, or None: no rows.
-    """
-    if dense is None or found.checks is None:
-        return []
-    rows: list[Row] = []
-    for part, left, carry, image in (
-        ("phase 1", found.checks.phase1, found.pose.inf_from_ct, 1),
-        ("chain", found.checks.chain, found.def_from_ct, 2),
-    ):
-        if left is None:
-            continue
-        error = carry(dense[:, 0]) - dense[:, image]
-        distance, number = cKDTree(dense[:, image]).query(left.points, 4)
-        weight = 1 / (distance + 1) ** 2
-        true = (error[number] * weight[..., None]).sum(axis=1) / weight.sum(axis=1, keepdims=True)
-        rows.append(
-            {
-                "part": part,
-                "looked for": left.looked_for,
-                "recognized": len(left.points),
-                "left over": _median_and_90(left.vectors),
-                "true error": _median_and_90(true),
-                "difference of both vectors": _median_and_90(left.vectors - true),
-            }
-        )
-    return rows
-
-
-def _median_and_90(vectors: Array) -> str:
-    return " / ".join(f"{mm:.2f}" for mm in np.percentile(np.linalg.norm(vectors, axis=1), (50, 90)))
 
 
 def score(answer: Localization, truth: Truth) -> Row:
