@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -139,6 +140,16 @@ def test_gap_between_two_pieces_of_lung_is_a_fissure(deflated: PreparedCbct, pri
     flat = np.abs(fissure.normals[:, 2]) > 0.8
     assert flat.mean() > 0.7
     assert_allclose(np.abs(fissure.points[flat, 2] + 10.0).mean(), 5.0, atol=0.4)
+
+
+@pytest.mark.parametrize(
+    ("air_ml", "contrast_hu", "collapsed"),
+    [(20.0, 100.0, True), (19.9, 100.0, False), (20.0, 99.9, False), (19.9, 99.9, False)],
+)
+def test_a_lung_is_collapsed_where_both_air_and_contrast_reach_their_limit(
+    found: Pneumothorax, air_ml: float, contrast_hu: float, collapsed: bool
+) -> None:
+    assert replace(found, air_ml=air_ml, contrast_hu=contrast_hu).is_collapsed is collapsed
 
 
 def test_inflated_lung_is_not_called_collapsed(prior: ThoraxPrior) -> None:
