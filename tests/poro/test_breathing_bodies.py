@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from breathing_shapes import HALF, pear
@@ -22,6 +24,17 @@ def test_a_regular_tetrahedron_has_quality_one_whatever_its_size() -> None:
     assert_allclose(np.abs(quality(7 * REGULAR, tets)), 1)
     flat = REGULAR * [1, 1, 0.1]
     assert abs(quality(flat, tets)[0]) < 0.6
+
+
+def test_elements_are_counted_beyond_their_limits_and_not_at_them() -> None:
+    """Edges of 5 to 10 mm are at the limit of a ratio of 2, of 4 to 10 beyond it; a regular element breaks none."""
+    tets = np.array([[0, 1, 2, 3]])
+    at = np.array([[0.0, 0, 0], [5, 0, 0], [6, 8, 0], [3, 4, 5]])
+    assert violations(TetMesh(at, tets)).aspect == 0
+    assert violations(TetMesh(at - [[0, 0, 0], [1, 0, 0], [0, 0, 0], [0, 0, 0]], tets)).aspect == 1
+    upright = tets if quality(REGULAR, tets)[0] > 0 else tets[:, [1, 0, 2, 3]]
+    regular = violations(TetMesh(REGULAR, upright))
+    assert regular == pytest.approx((0, 0, 0, 0, 1))
 
 
 def test_the_slope_of_the_quality_is_its_derivative() -> None:
@@ -115,3 +128,16 @@ def test_a_sliding_lung_leaves_the_elastic_body_and_a_swelling_one_moves_it(arou
     assert steps <= 500
     assert np.abs(by_springs[scene.still]).max() == 0
     assert np.linalg.norm(by_springs - u, axis=1).mean() < np.linalg.norm(u, axis=1).mean()
+
+
+def test_springs_are_as_stiff_as_their_grey_values_say(around: tuple[Body, TetMesh]) -> None:
+    """In a body of lung's grey value above and of soft tissue below, what is soft moves more than in an even one."""
+    scene, lung = around
+    swollen = border_motion([lung.boundary], [0.1 * lung.boundary.points], scene.mesh.points[scene.near])
+    above = scene.mesh.points[:, 2] > 0
+    even = network(scene, swollen)[0]
+    mixed = network(replace(scene, hu=np.where(above, -900.0, 0.0)), swollen)[0]
+    rim = ~np.isin(np.arange(len(above)), np.append(scene.near, scene.still))
+    between = rim & (np.abs(scene.mesh.points[:, 2]) < 40)
+    apart = np.linalg.norm(mixed - even, axis=1)
+    assert apart[between].max() > 0.03 * np.linalg.norm(even[between], axis=1).max()

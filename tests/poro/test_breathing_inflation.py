@@ -8,11 +8,13 @@ from breathing_shapes import pear
 from numpy.testing import assert_allclose
 from scipy.sparse import diags
 
+from poro.arrays import Array
+from poro.breathing import one_scan as module
 from poro.breathing.cavity import inflating
 from poro.breathing.elastic import WALL_ALONE, Lung
 from poro.breathing.equilibrium import Balance, PointConstraints, Scene, balance, volume
-from poro.breathing.inflation import fill, fill_to
-from poro.breathing.one_scan import one_scan, regions
+from poro.breathing.inflation import Filled, fill, fill_to
+from poro.breathing.one_scan import _wall, one_scan, regions
 from poro.breathing.pressure_volume import PER_PA, inspired_volume, pressure_volume
 from poro.fem import Tissue, neo_hookean
 from poro.mesh import TetMesh
@@ -88,6 +90,46 @@ def test_apex_spine_and_diaphragm_lie_where_they_should(feet: float) -> None:
     assert (surface.points[where.spine, 0] < 0).all()  # the right lung's inner side
     assert (surface.points[where.flank, 0] > 0).all()
     assert not (where.diaphragm & where.spine).any()
+
+
+def test_the_wall_asks_chest_and_diaphragm_for_their_shares_of_a_breath() -> None:
+    """Forces of 1 mm3 are the constraints' own at the step that makes it: 45 % by the chest, the rest downwards."""
+    mesh = pear(18.0)
+    surface, area = mesh.boundary, mesh.boundary.node_areas
+    where = regions(surface, "right", -1.0)
+    matrix, force = _wall(mesh, "right", where, -1.0)
+    blocks = matrix.toarray().reshape(len(mesh.points), 3, -1)
+    own = np.stack([blocks[n, :, 3 * n : 3 * n + 3] for n in surface.nodes])
+    normal, down = surface.node_normals, np.array([0.0, 0.0, -1.0])
+    firm = np.where(where.diaphragm, 0.03, 0.3) * area
+    along = np.where(where.diaphragm[:, None], down, normal)
+    assert_allclose(own, firm[:, None, None] * along[:, :, None] * along[:, None, :], atol=1e-12)
+    pushed = np.einsum("nd,nd->n", force[surface.nodes], along) / firm  # mm for 1 mm3
+    made = area * np.einsum("nd,nd->n", pushed[:, None] * along, normal)
+    assert made[where.diaphragm].sum() == pytest.approx(0.55)
+    assert made[~where.diaphragm].sum() == pytest.approx(0.45)
+    assert np.abs(force[np.setdiff1d(np.arange(len(mesh.points)), surface.nodes)]).max() == 0
+
+
+def test_the_diaphragm_s_traction_follows_the_logarithm_of_the_volume(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[Scene] = []
+
+    def watched(scene: Scene, wanted: float, u: Array) -> Filled:
+        asked.append(scene)
+        return Filled(u, 0.0, 1, True, wanted)
+
+    monkeypatch.setattr(module, "fill_to", watched)
+    scene = one_scan(pear(18.0), "right")
+    rest, more = float(scene.mesh.volumes.sum()), 1.2
+    scene.states([more * rest, more * rest], traction=0.5)
+    scene.states([more * rest], traction=0.7)
+    assert_allclose(asked[0].constraints.force, asked[1].constraints.force)
+    pulled = asked[2].constraints.force - asked[0].constraints.force
+    assert_allclose(pulled, 0.2 * scene.bulk_kpa * np.log(more) * scene.pull, atol=1e-12)
+    area = scene.mesh.boundary.node_areas[scene.regions.diaphragm].sum()
+    assert scene.pull.sum(axis=0) == pytest.approx([0, 0, -area])
+    tissue = Tissue()
+    assert scene.bulk_kpa == pytest.approx(tissue.young_kpa / 3 / (1 - 2 * tissue.poisson))
 
 
 def test_a_breath_of_one_scan_lowers_the_diaphragm_and_keeps_the_apex() -> None:
