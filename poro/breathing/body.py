@@ -99,7 +99,7 @@ def network(scene: Body, wanted: Array) -> tuple[Array, int]:
     )
     a, b = edges.T
     hu = (scene.hu[a] + scene.hu[b]) / 2
-    spring = np.where(hu > 700, 1 - 0.2 * np.exp(-(hu - 700) / 500), 0.001 + 0.799 * np.clip((hu + 1000) / 1700, 0, 1))
+    spring = spring_stiffness(hu)
     density = np.where(scene.hu < -13, 1.1e-3 * scene.hu + 1.06, 6e-4 * scene.hu + 1.081)
     mass = np.maximum(density, 0.05)
     n = len(mesh.points)
@@ -120,6 +120,12 @@ def network(scene: Body, wanted: Array) -> tuple[Array, int]:
         if np.abs(step).max() < SETTLED_MM * 1e-2:
             break
     return u, taken
+
+
+def spring_stiffness(hu: Array) -> Array:
+    """Stiffness (n,) of springs between grey values hu (n,), without unit. Ref: section 4.1."""
+    soft = 0.001 + 0.799 * np.clip((hu + 1000) / 1700, 0, 1)
+    return np.where(hu > 700, 1 - 0.2 * np.exp(-(hu - 700) / 500), soft)
 
 
 def _moduli(young: Array) -> Array:
