@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from breathing_shapes import HALF, pear
 from numpy.testing import assert_allclose
+from scipy.spatial import cKDTree
 
 from poro.arrays import Array
 from poro.breathing.body import Body, body, border_motion, network, spring_stiffness
@@ -71,6 +72,15 @@ def chest() -> tuple[Thorax, Lung]:
     inspired = TetMesh(fixed + stretch * (expired.points - fixed), expired.tets)
     lung = Lung("right", inspired, expired)
     return thorax(inside, affine, lung, WALL_ALONE), lung
+
+
+def test_chest_and_abdomen_reach_30_mm_about_the_lung_s_voxels(chest: tuple[Thorax, Lung]) -> None:
+    scene, lung = chest
+    inside, affine = ball_mask()
+    voxels = np.argwhere(inside) * affine[0, 0] + affine[:3, 3]
+    far = cKDTree(voxels).query(scene.mesh.points[len(lung.expired.points) :])[0]
+    assert 29.0 < far.max() < 32.0  # 33.4 with the voxels that are 30 mm off
+    assert far.min() > 0.5
 
 
 def test_pressures_pull_lung_and_wall_outward_and_their_derivative_is_what_they_do(chest: tuple[Thorax, Lung]) -> None:
