@@ -57,7 +57,7 @@ def contents(result: Path) -> dict[str, Any]:
     """Every file of a result but what tells time and place."""
     found: dict[str, Any] = {name: (result / name).read_bytes() for name in OUTPUT_FILES}
     run = json.loads(found.pop("run.json"))
-    for name in ("report.html", "scene_with_scans.mrml"):
+    for name in ("report.html", "scene_with_scans.mrml", "inputs.json"):
         del found[name]
     return {**found, "run": {key: value for key, value in run.items() if key not in TIMED}}
 
@@ -74,8 +74,9 @@ def test_a_run_from_either_state_is_the_plain_run_to_the_last_bit(
         assert "CT lungs ..." not in said
         assert ("free-form deformation ..." in said) == (state == states[0])
         found = contents(tmp_path / str(number))
-        of_place = {"inputs.json"} if folder == bare else set()
-        assert {name for name in plain if found[name] != plain[name]} <= of_place
+        assert [name for name in plain if found[name] != plain[name]] == []
+        inputs = json.loads((tmp_path / str(number) / "inputs.json").read_text(encoding="utf-8"))
+        assert (tmp_path / str(number) / inputs["case"]).resolve() == folder.resolve()
 
 
 def test_what_was_prepared_after_the_ct_is_not_done_again(states: tuple[Path, Path, list[str]]) -> None:
