@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from vatsloc.workflow.fissures import Fissure, Sheet, find_fissure, mapped, smooth_map
+from vatsloc.workflow.fissures import Fissure, Sheet, _Scene, find_fissure, mapped, smooth_map
 
 HILUM = np.array([50.0, 10.0, -100.0])
 TRUE = Sheet(HILUM, np.array([0.9, 0.1, 6.0, 4.0, -3.0, 2.0]))
@@ -73,6 +73,25 @@ def test_a_sheet_is_a_distance_for_planes_and_positive_above() -> None:
     plane = Sheet(HILUM, np.array([1.0, 0.0, 5.0, 0.0, 0.0, 0.0]))
     above = HILUM + np.array([[0.0, 0.0, 0.0], [7.0, 0.0, 5.0], [0.0, -5.0, 0.0]])
     np.testing.assert_allclose(plane.distance(above), np.array([5.0, 10.0, 0.0]) / np.sqrt(2), atol=1e-12)
+
+
+def test_a_bowed_sheet_bulges_by_its_numbers_at_60_mm() -> None:
+    bowed = Sheet(HILUM, np.array([0.0, 0.0, 5.0, 4.0, -2.0, 3.0]))
+    at = HILUM + np.array([[0.0, 0, 0], [60, 0, 0], [0, 60, 0], [60, -60, 0]])
+    # 4 (u^2 - 1/2) - 2 (v^2 - 1/2) + 3 u v, and 5 mm below the hilum
+    np.testing.assert_allclose(bowed.distance(at), np.array([-1.0, 3.0, -3.0, -2.0]) + 5, atol=1e-12)
+
+
+def test_keypoints_on_either_side_are_told_apart_at_the_sheet_itself() -> None:
+    """Two motions that part at a plane cost nothing, although keypoints lie half a millimetre from it."""
+    rng = np.random.default_rng(7)
+    side = np.repeat([1.0, -1.0], 60)
+    points = HILUM + np.column_stack([rng.uniform(-50, 50, (120, 2)), 0.5 * side])
+    motion = np.outer(side, [0.0, 0.0, 8.0])
+    scene = _Scene(points, motion, np.zeros((0, 3)), HILUM)
+    plane, lower = np.zeros(6), np.array([0.0, 0.0, 2.0, 0, 0, 0])
+    assert scene.motion_cost(plane) < 1e-3
+    assert scene.motion_cost(lower) == np.inf  # all of them lie above
 
 
 def test_a_smooth_map_is_followed_and_strays_are_not() -> None:
