@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 
 from registration.volume import Volume
 from tests.vatsloc import imaging_thorax as known
 from vatsloc.errors import InputRefused
-from vatsloc.imaging.cbct import Cupping, field_of_view, prepare_cbct
+from vatsloc.imaging.cbct import Cupping, _lean_and_fat, _ridge, field_of_view, prepare_cbct
 from vatsloc.imaging.spine import _column, segment_spine
 
 
@@ -122,3 +124,23 @@ def test_a_bright_sternum_is_not_taken_for_the_spine() -> None:
     done = prepare_cbct(known.cone_beam(Volume(hu, scene.volume.ras_from_ijk), (25.0, 10.0), 105.0))
     spine = segment_spine(done.volume, done.field.usable)
     assert_allclose(spine.centres_ras[:, 1], -58.0, atol=10.0)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_ridge_is_the_best_of_all_paths_that_are_not_too_steep(seed: int) -> None:
+    score, steepest = np.random.default_rng(seed).uniform(0, 1, (5, 6)), 2
+    paths = np.array(list(product(range(6), repeat=5)))
+    steps = np.abs(np.diff(paths, axis=1))
+    total = score[np.arange(5), paths].sum(axis=1) - 0.05 * steps.sum(axis=1)
+    assert_array_equal(_ridge(score, steepest), paths[np.where(steps.max(axis=1) <= steepest, total, -np.inf).argmax()])
+
+
+def test_a_ring_s_likelihood_is_that_of_normal_densities_on_a_floor() -> None:
+    """All of a ring at one grey value, which is lean tissue's or fat's: a density of 1 / (32 sqrt(2 pi)) there."""
+    level = np.arange(-400.0, 400.0, 5.0)
+    share = (level == 40.0).astype(float)[None]
+    peak = 1 / (32 * np.sqrt(2 * np.pi))
+    lean, fat = _lean_and_fat(share, level, np.array([40.0, 145.0]))[0]
+    assert lean == pytest.approx(np.log(0.15 / 560 + 0.85 * peak))
+    beside = peak * np.exp(-0.5 * (105 / 32) ** 2)
+    assert fat == pytest.approx(np.log(0.15 / 560 + 0.85 * (0.25 * beside + 0.75 * peak)) - 0.15 * 0.75)
