@@ -17,7 +17,7 @@ from poro.collapse.solution import sensitivity
 from poro.fem import Tissue
 from poro.fit import Fit, FitSettings, FitStatus, Target, ellipsoid95, fit_collapse, identifiability, point_covariance
 from poro.fit.identifiability import THETA_NAMES
-from poro.fit.observations import Observer
+from poro.fit.observations import Observer, independence
 from poro.fit.problem import STEP_SCALE, FitProblem
 from poro.mesh import TetMesh, interpolate, locate
 
@@ -262,3 +262,11 @@ def test_empty_targets_and_wrong_gravity_are_refused(system: PoroSystem) -> None
         fit_collapse(system, Target(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)))
     with pytest.raises(ValueError, match="unit vector"):
         assemble(system.mesh, TISSUE, 2 * GRAVITY, system.hilum, system.hilum_displacement)
+
+
+def test_points_share_their_weight_with_neighbours_within_half_the_correlation_length() -> None:
+    points = np.array([[0.0, 0, 0], [0, 0, 0], [0, 0, 7], [0, 0, 14.6]])
+    assert_allclose(independence(points, 15.0), [1 / 3, 1 / 3, 1 / 3, 1])
+    assert_allclose(independence(points, 15.3), [1 / 3, 1 / 3, 1 / 4, 1 / 2])
+    assert_allclose(independence(points, 0.0), 1)  # two at one place count in full too
+    assert independence(np.zeros((0, 3)), 15.0).shape == (0,)
