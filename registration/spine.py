@@ -202,10 +202,14 @@ def _rotations(half_width: float) -> list[Array]:
     return [Rotation.from_rotvec(v, degrees=True).as_matrix() for v in vectors]
 
 
-def _near_spine(spine: Mask, points: Array, reach_mm: float = 30.0) -> Array:
+NEAR_SPINE_MM = 30.0
+"""How far from the spine an image is compared."""
+
+
+def _near_spine(spine: Mask, points: Array) -> Array:
     inside = spine.grid.to_ras(np.argwhere(spine.inside[::4, ::4, ::2]) * [4.0, 4.0, 2.0])
     squared = np.min(np.sum((points[:, None] - inside[None, :: max(len(inside) // 400, 1)]) ** 2, axis=2), axis=1)
-    return np.asarray(squared <= reach_mm**2)
+    return np.asarray(squared <= NEAR_SPINE_MM**2)
 
 
 @njit(cache=True, parallel=True)

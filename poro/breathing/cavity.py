@@ -55,7 +55,7 @@ class Inflating:
         )
 
 
-def inflating(lung: Lung, acting: Breathing, material: ConstitutiveModel | None = None) -> Inflating:
+def inflating(lung: Lung, acting: Breathing) -> Inflating:
     """The scene of a lung's inspiration; tissue is neo-Hookean with the moduli of `Tissue` where none is given."""
     tissue, mesh, border = Tissue(), lung.expired, lung.expired.boundary
     level = level_set(lung.inspired.boundary, STEP_MM, SMOOTH_MM)
@@ -63,7 +63,7 @@ def inflating(lung: Lung, acting: Breathing, material: ConstitutiveModel | None 
     constraints, load = rising(lung, acting, tissue)
     return Inflating(
         mesh,
-        material or neo_hookean(tissue),
+        neo_hookean(tissue),
         Cavity(level, border.nodes, WALL_KPA_PER_MM * border.node_areas, behind),
         constraints,
         load,

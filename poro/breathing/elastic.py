@@ -86,13 +86,13 @@ def acting_at(depth: float) -> Breathing:
     )
 
 
-def breathe_out(lung: Lung, acting: Breathing, tissue: Tissue | None = None) -> Array:
+def breathe_out(lung: Lung, acting: Breathing) -> Array:
     """Nodes (n, 3) of the inspired lung's mesh after expiration.
 
     The lung stretched to the expired one's centre and spread rests without stress; from there the wall, both surfaces'
     nearest points along the normals alone, pulls it, and what acts within.
     """
-    tissue = tissue or Tissue()
+    tissue = Tissue()
     start = spread_map(lung.inspired, lung.expired)
     rest = TetMesh(start(lung.inspired.points), lung.inspired.tets)
     held, pull = bronchi(lung, acting)

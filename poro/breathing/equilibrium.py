@@ -102,7 +102,7 @@ def tree_of(mesh: TetMesh) -> Tree:
     return elimination_tree(tangent_stiffness(mesh, still), mesh.points)
 
 
-def balance(scene: Scene, start: Array | None = None, tolerance: float = 1e-4, steps: int = MAX_STEPS) -> Equilibrium:
+def balance(scene: Scene, start: Array | None = None, tolerance: float = 1e-4) -> Equilibrium:
     """Displacement (n, 3) mm at which a scene's forces balance, from `start`; tolerance: residual over the loads.
 
     Raises SolverError when nothing holds the body.
@@ -110,7 +110,7 @@ def balance(scene: Scene, start: Array | None = None, tolerance: float = 1e-4, s
     u = np.zeros_like(scene.mesh.points) if start is None else start
     residuals: list[float] = []
     solver: LinearSolver | None = None
-    for _ in range(steps):
+    for _ in range(MAX_STEPS):
         unbalanced, scale, tangents = _linearized(scene, u)
         residuals.append(float(np.abs(unbalanced).max() / scale))
         if residuals[-1] < tolerance and solver is not None:

@@ -63,7 +63,7 @@ def violations(mesh: TetMesh) -> Shares:
     )
 
 
-def smooth(mesh: TetMesh, rounds: int = ROUNDS) -> TetMesh:
+def smooth(mesh: TetMesh) -> TetMesh:
     """The mesh with its inner nodes moved uphill in quality, worst elements first; the surface stays.
 
     A step is the gradient of the sum of 1/q over the elements, taken where it does not lower the worst quality about a
@@ -73,7 +73,7 @@ def smooth(mesh: TetMesh, rounds: int = ROUNDS) -> TetMesh:
     inner = np.ones(len(points), bool)
     inner[mesh.boundary.nodes] = False
     shortest = _shortest(points, tets)
-    for _ in range(rounds):
+    for _ in range(ROUNDS):
         pull = np.zeros_like(points)
         q, slope = _slopes(points, tets)
         for k in range(4):

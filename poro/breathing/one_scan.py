@@ -103,8 +103,8 @@ class OneScan:
         return found
 
 
-def one_scan(mesh: TetMesh, side: Side, material: ConstitutiveModel | None = None) -> OneScan:
-    """The scene of a lung's mesh; Ogden's tissue where none is given. Raises ValueError without a diaphragm."""
+def one_scan(mesh: TetMesh, side: Side) -> OneScan:
+    """The scene of a lung's mesh, of Ogden's tissue. Raises ValueError without a diaphragm."""
     tissue, surface, feet = Tissue(), mesh.boundary, caudal(mesh)
     where = regions(surface, side, feet)
     size = np.sqrt(surface.node_areas)
@@ -122,7 +122,7 @@ def one_scan(mesh: TetMesh, side: Side, material: ConstitutiveModel | None = Non
     bulk = tissue.lame_kpa + 2 * tissue.shear_kpa / 3
     weight = np.zeros_like(mesh.points)
     weight[:, 1] = -MASS_KG * 1e9 * GRAVITY_KPA_PER_MM * mesh.node_volumes / mesh.volumes.sum()
-    return OneScan(mesh, material or ogden_lung(tissue), constraints, pull, where, bulk, wanted, weight)
+    return OneScan(mesh, ogden_lung(tissue), constraints, pull, where, bulk, wanted, weight)
 
 
 def _wall(mesh: TetMesh, side: Side, where: Regions, feet: float) -> tuple[bsr_matrix, Array]:

@@ -91,7 +91,11 @@ class PressureFit:
     evaluations: int
 
 
-def thorax(inside: Array, ras_from_ijk: Array, pair: Lung, acting: Breathing, edge_mm: float = 22.0) -> Thorax:
+EDGE_MM = 22.0
+"""Of the tetrahedra of the chest and of what lies below."""
+
+
+def thorax(inside: Array, ras_from_ijk: Array, pair: Lung, acting: Breathing) -> Thorax:
     """Chest and sub-diaphragm bodies about the mask of an expired lung, voxels along R, A, S.
 
     What lies below the lung is found by casting the lung towards the feet. Raises ValueError where a body is too thin.
@@ -113,7 +117,7 @@ def thorax(inside: Array, ras_from_ijk: Array, pair: Lung, acting: Breathing, ed
     below = near & above & ~last & ~coarse
     below = _largest(below)
     chest = near & ~coarse & (ndimage.distance_transform_edt(~below, sampling=spacing) > APART_MM)
-    bodies = [stuff(chest, affine, edge_mm), stuff(below, affine, edge_mm)]
+    bodies = [stuff(chest, affine, EDGE_MM), stuff(below, affine, EDGE_MM)]
     starts = np.cumsum([0, len(lung.points), len(bodies[0].points), len(bodies[1].points)])
     points = np.concatenate([lung.points, *(body.points for body in bodies)])
     tets = np.concatenate([mesh.tets + start for mesh, start in zip((lung, *bodies), starts[:-1], strict=True)])

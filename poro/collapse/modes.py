@@ -34,7 +34,11 @@ def eigenstrain_mode(mesh: TetMesh, tissue: Tissue, name: str, strain: Array, si
     return LoadMode(name, eigenstress_load(mesh, stress), np.zeros_like(mesh.points), sigma)
 
 
-def uniform_strain_modes(mesh: TetMesh, tissue: Tissue, sigma: float = 0.1) -> tuple[LoadMode, ...]:
+STRAIN_SIGMA = 0.1
+"""Prior standard deviation of a uniform strain."""
+
+
+def uniform_strain_modes(mesh: TetMesh, tissue: Tissue) -> tuple[LoadMode, ...]:
     """The six components of a uniform strain of the stress-free shape, volume kept or not."""
     result = []
     for i in range(3):
@@ -42,19 +46,25 @@ def uniform_strain_modes(mesh: TetMesh, tissue: Tissue, sigma: float = 0.1) -> t
             unit = np.zeros((3, 3))
             unit[i, j] = unit[j, i] = 1 if i == j else 0.5
             strain = np.broadcast_to(unit, (len(mesh.tets), 3, 3))
-            result.append(eigenstrain_mode(mesh, tissue, f"strain {'RAS'[i]}{'RAS'[j]}", strain, sigma))
+            result.append(eigenstrain_mode(mesh, tissue, f"strain {'RAS'[i]}{'RAS'[j]}", strain, STRAIN_SIGMA))
     return tuple(result)
 
 
-def hilum_modes(mesh: TetMesh, hilum: Array, sigma_mm: float = 3.0, sigma_rad: float = 0.1) -> tuple[LoadMode, ...]:
+SHIFT_SIGMA_MM = 3.0
+"""Prior standard deviation of a shift of the hilum."""
+TURN_SIGMA_RAD = 0.1
+"""Prior standard deviation of a turn of the hilum."""
+
+
+def hilum_modes(mesh: TetMesh, hilum: Array) -> tuple[LoadMode, ...]:
     """Translations and rotations of the held nodes, for a hilum whose motion is only roughly known."""
     centre = mesh.points[hilum].mean(axis=0)
     result = []
     for axis in range(3):
         unit = np.eye(3)[axis]
         for name, motion, sigma in (
-            ("hilum shift", np.broadcast_to(unit, (len(hilum), 3)), sigma_mm),
-            ("hilum turn", np.cross(unit, mesh.points[hilum] - centre), sigma_rad),
+            ("hilum shift", np.broadcast_to(unit, (len(hilum), 3)), SHIFT_SIGMA_MM),
+            ("hilum turn", np.cross(unit, mesh.points[hilum] - centre), TURN_SIGMA_RAD),
         ):
             imposed = np.zeros_like(mesh.points)
             imposed[hilum] = motion

@@ -27,10 +27,14 @@ class LevelSet:
         return _evaluate(self.coefficients, ijk, self.step_mm)
 
 
-def level_set(surface: TriSurface, step_mm: float, smooth_mm: float, margin_mm: float = 30.0) -> LevelSet:
+MARGIN_MM = 30.0
+"""How far beyond a surface its distance is known."""
+
+
+def level_set(surface: TriSurface, step_mm: float, smooth_mm: float) -> LevelSet:
     """Signed distance to a closed surface, sampled every `step_mm` and smoothed by a Gaussian of `smooth_mm`."""
-    origin = surface.points.min(axis=0) - margin_mm
-    shape = np.ceil((surface.points.max(axis=0) + margin_mm - origin) / step_mm).astype(int) + 1
+    origin = surface.points.min(axis=0) - MARGIN_MM
+    shape = np.ceil((surface.points.max(axis=0) + MARGIN_MM - origin) / step_mm).astype(int) + 1
     axes = [origin[d] + step_mm * np.arange(shape[d]) for d in range(3)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
     distance = -closest_points(surface, points).distance.reshape(shape)

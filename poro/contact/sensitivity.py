@@ -52,12 +52,16 @@ def _solved(matrix: Array, right: Array) -> Array:
     return np.asarray(solve(matrix, right, assume_a="sym"))
 
 
-def _nodal_stiffness(force: Array, hessian: Array, cut: float = 1e-4) -> tuple[Array, Array, Array]:
+LEAST_SHARE = 1e-4
+"""Of the largest eigenvalue; what is smaller is left out."""
+
+
+def _nodal_stiffness(force: Array, hessian: Array) -> tuple[Array, Array, Array]:
     """Geometric stiffness node by node: nodes (r,), directions (r, 3) and eigenvalues (r,) kPa mm of it under forces
     (nc,).
     """
     nodes = np.flatnonzero(force)
     values, vectors = np.linalg.eigh(-force[nodes, None, None] * hessian[nodes])
     flat = values.ravel()
-    keep = np.abs(flat) > cut * np.abs(flat).max(initial=0)
+    keep = np.abs(flat) > LEAST_SHARE * np.abs(flat).max(initial=0)
     return np.repeat(nodes, 3)[keep], vectors.transpose(0, 2, 1).reshape(-1, 3)[keep], flat[keep]

@@ -40,6 +40,10 @@ class Extrapolation:
     status: ExtrapolationStatus
 
 
+MAX_ROUNDS = 4
+"""Of releasing nodes whose elements are squeezed."""
+
+
 def extrapolate(
     mesh: TetMesh,
     nodes: Array,
@@ -47,7 +51,6 @@ def extrapolate(
     tissue: Tissue,
     weights: Array | None = None,
     min_det: float = 0.05,
-    max_rounds: int = 4,
 ) -> Extrapolation:
     """Continue displacements (k, 3) mm of `nodes` (k,) elastically to the whole mesh.
 
@@ -69,7 +72,7 @@ def extrapolate(
         det_f = np.linalg.det(deformation_gradient(mesh, u))
         bad = np.unique(mesh.tets[det_f < min_det])
         release = kept & np.isin(nodes, bad)
-        if rounds == max_rounds or not release.any() or (kept & ~release).sum() < 3:
+        if rounds == MAX_ROUNDS or not release.any() or (kept & ~release).sum() < 3:
             break
         kept &= ~release
     status = ExtrapolationStatus.SOLVED if kept.all() else ExtrapolationStatus.RELEASED

@@ -134,16 +134,20 @@ def solve_once(matrix: csr_matrix, points: Array, right: Array) -> Array:
     return linear_solver(matrix, points, tree).solve(right)
 
 
-def inverse_at(solver: LinearSolver, unknowns: Array, size: int, dtype: type, batch: int = 384) -> Array:
+BATCH = 384
+"""Right-hand sides that are solved together."""
+
+
+def inverse_at(solver: LinearSolver, unknowns: Array, size: int, dtype: type) -> Array:
     """Rows and columns (k, k) of type `dtype` of the inverse of a matrix of `size` unknowns at distinct ones (k,)."""
     if isinstance(solver, Cholesky):
         return solver.inverse_at(unknowns, dtype)
     result: Array = np.empty((len(unknowns), len(unknowns)), dtype)
-    for first in range(0, len(unknowns), batch):
-        chunk = unknowns[first : first + batch]
+    for first in range(0, len(unknowns), BATCH):
+        chunk = unknowns[first : first + BATCH]
         right = np.zeros((size, len(chunk)))
         right[chunk, np.arange(len(chunk))] = 1
-        result[:, first : first + batch] = solver.solve(right)[unknowns]
+        result[:, first : first + BATCH] = solver.solve(right)[unknowns]
     return result
 
 

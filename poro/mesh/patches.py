@@ -35,7 +35,11 @@ def principal_axis(mesh: TetMesh) -> Array:
     return axis if axis[2] >= 0 else -axis
 
 
-def patches(surface: TriSurface, hilum_points: Array, hilum_radius_mm: float = 12.0) -> Patches:
+HILUM_RADIUS_MM = 12.0
+"""What is so near to a point of the hilum belongs to it."""
+
+
+def patches(surface: TriSurface, hilum_points: Array) -> Patches:
     """Diaphragm (largest inferior-facing piece), hilum (near given points (k, 3)), mediastinal (facing the hilum),
     costal.
 
@@ -45,7 +49,7 @@ def patches(surface: TriSurface, hilum_points: Array, hilum_radius_mm: float = 1
     hilum_points = np.atleast_2d(hilum_points)
     centre = np.average(surface.points, axis=0, weights=surface.node_areas)
     medial = np.array([np.sign(hilum_points[:, 0].mean() - centre[0]), 0.0, 0.0])
-    hilum = cKDTree(hilum_points).query(surface.points)[0] <= hilum_radius_mm
+    hilum = cKDTree(hilum_points).query(surface.points)[0] <= HILUM_RADIUS_MM
     below = surface.points[:, 2] < centre[2]
     down = (normal[:, 2] < -DOWN) & below & ~hilum
     if not down.any():

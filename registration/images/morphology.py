@@ -49,9 +49,9 @@ def close(inside: Array, radius_mm: float, spacing: Array) -> Array:
     return erode(dilate(inside, radius_mm, spacing), radius_mm, spacing) | inside
 
 
-def largest(inside: Array, structure: Array | None = None) -> Array:
+def largest(inside: Array) -> Array:
     """The largest connected part (empty when `inside` is)."""
-    labels, count = ndimage.label(inside, structure)
+    labels, count = ndimage.label(inside)
     if count == 0:
         return inside.copy()
     sizes = np.bincount(labels.ravel())

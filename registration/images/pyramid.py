@@ -77,9 +77,13 @@ class Pyramid:
         return PyramidLevel(Samples(fixed.grid, index), fixed.hu.reshape(-1)[index], moving, seen)
 
 
-def cropped(fixed: Volume, mask: Mask, margin_mm: float = 8.0) -> tuple[Volume, Mask]:
+MARGIN_MM = 8.0
+"""What is kept around a mask."""
+
+
+def cropped(fixed: Volume, mask: Mask) -> tuple[Volume, Mask]:
     """Both restricted to the mask's bounding box and a margin."""
     if not fixed.grid.same_as(mask.grid):
         raise ValueError(f"the fixed mask must lie on the fixed image's grid: {mask!r} against {fixed!r}; resample it")
-    cut = bounding_box(mask.inside, np.ceil(margin_mm / fixed.grid.spacing).astype(int))
+    cut = bounding_box(mask.inside, np.ceil(MARGIN_MM / fixed.grid.spacing).astype(int))
     return fixed.part(cut), mask.part(cut)

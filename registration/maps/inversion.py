@@ -23,12 +23,15 @@ class Inversion:
     iterations: int
 
 
+ITERATIONS = 50
+"""At most; the last two thirds are Newton steps."""
+
+
 def invert_at(
     moving_from_fixed: PointMap,
     points_moving: Array,
     start: Array | None = None,
     tolerance_mm: float = 0.01,
-    iterations: int = 50,
 ) -> Inversion:
     """Solve moving_from_fixed(x) = y for x (n, 3) at points y (n, 3), RAS mm.
 
@@ -42,11 +45,11 @@ def invert_at(
     gap = y - moving_from_fixed(x)
     residual = np.linalg.norm(gap, axis=1)
     step, count = np.ones(len(x)), 0
-    for count in range(1, iterations + 1):
+    for count in range(1, ITERATIONS + 1):
         active = np.flatnonzero(residual > tolerance_mm)
         if len(active) == 0:
             return Inversion(x, residual, count - 1)
-        newton = count > iterations // 3
+        newton = count > ITERATIONS // 3
         direction = _newton(moving_from_fixed, x[active], gap[active]) if newton else gap[active]
         trial = x[active] + step[active, None] * direction
         new_gap = y[active] - moving_from_fixed(trial)

@@ -50,21 +50,25 @@ class Descent:
     solves: tuple[tuple[SolveStatus, tuple[float, ...]], ...]
 
 
+LEAST_GAIN = 1e-3
+"""Share of the objective that a step has to lower it by."""
+LEAST_STEP_MM = 0.02
+"""A step that moves no control point by more is the last one."""
+
+
 def gauss_newton(
     objective: Term,
     start: Array,
     steps: int = 15,
-    tolerance: float = 1e-3,
-    step_mm: float = 0.02,
     residual: float = 0.1,
     refresh: Callable[[Array], None] | None = None,
 ) -> Descent:
     """Minimize the objective from `start` (3, ni, nj, nk).
 
-    Stops when a step lowers the objective by less than `tolerance` of itself, moves no control point by more than
-    `step_mm`, or after `steps` steps. Each direction solves H d = -g by Jacobi-preconditioned conjugate gradients to a
-    relative residual `residual` or 40 iterations; the step is halved until Armijo's condition (1e-4) holds. refresh:
-    called with c before each step, to reset what the objective holds fixed during a step.
+    Stops when a step lowers the objective by less than `LEAST_GAIN` of itself, moves no control point by more than
+    `LEAST_STEP_MM`, or after `steps` steps. Each direction solves H d = -g by Jacobi-preconditioned conjugate
+    gradients to a relative residual `residual` or 40 iterations; the step is halved until Armijo's condition (1e-4)
+    holds. refresh: called with c before each step, to reset what the objective holds fixed during a step.
     """
     c: Array = start.astype(np.float32)
     history: list[float] = []
@@ -91,9 +95,9 @@ def gauss_newton(
         if new >= value:
             return ended(c, Stop.NO_DESCENT)
         c = trial
-        if value - new < tolerance * abs(value):
+        if value - new < LEAST_GAIN * abs(value):
             return ended(c, Stop.CONVERGED, new)
-        if scale * np.abs(d).max() < step_mm:
+        if scale * np.abs(d).max() < LEAST_STEP_MM:
             return ended(c, Stop.SMALL_STEP, new)
     return ended(c, Stop.ITERATIONS, new)
 

@@ -48,10 +48,14 @@ class Radiograph:
         return np.asarray(np.clip(np.rint(1000 * self.integrals), 0, 65535), np.uint16)
 
 
-def radiograph(
-    ct: Volume, view: str, pixels: int = 256, source_mm: float = 1000.0, detector_mm: float = 400.0
-) -> Radiograph:
-    """What a detector `detector_mm` behind the image's centre sees from a source `source_mm` before it.
+SOURCE_MM = 1000.0
+"""Source to the middle of the image."""
+DETECTOR_MM = 400.0
+"""Middle of the image to the detector."""
+
+
+def radiograph(ct: Volume, view: str, pixels: int = 256) -> Radiograph:
+    """What a detector `DETECTOR_MM` behind the image's centre sees from a source `SOURCE_MM` before it.
 
     ct: HU, axes along R, A, S. view: "frontal" or "lateral".
     """
@@ -64,10 +68,10 @@ def radiograph(
     up = np.array([0.0, 0.0, 1.0])
     # The patient's right on the left of a frontal view; his front on the left of a lateral one.
     across = np.array([-1.0, 0.0, 0.0]) if axis == 1 else np.array([0.0, -1.0, 0.0])
-    source = centre - source_mm * beam
-    width = max(size[1 - axis], size[2]) * (source_mm + detector_mm) / (source_mm - size[axis] / 2)
+    source = centre - SOURCE_MM * beam
+    width = max(size[1 - axis], size[2]) * (SOURCE_MM + DETECTOR_MM) / (SOURCE_MM - size[axis] / 2)
     pixel = float(width / pixels)
-    corner = centre + detector_mm * beam + (pixels - 1) / 2 * pixel * (up - across)
+    corner = centre + DETECTOR_MM * beam + (pixels - 1) / 2 * pixel * (up - across)
     index = np.arange(pixels)
     targets = corner + pixel * (index[None, :, None] * across - index[:, None, None] * up)
     per_mm = np.ascontiguousarray(WATER_PER_MM * np.maximum(1 + ct.hu / 1000, 0), np.float32)

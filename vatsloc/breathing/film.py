@@ -58,23 +58,31 @@ def frames(motion: Motion) -> list[Array]:
     return pictures
 
 
-def slice_of(volume: Volume, axis: int, at_ras: float, window: tuple[float, float] = (-1000.0, 300.0)) -> Array:
+WINDOW_HU = (-1000.0, 300.0)
+"""Black and white of a picture."""
+
+
+def slice_of(volume: Volume, axis: int, at_ras: float) -> Array:
     """A plane of an image stored along R, A, S as a picture (h, w) uint8, head up, the patient's right on the left."""
     index = int(np.clip(round(volume.grid.to_ijk(np.full(3, at_ras))[axis]), 0, volume.hu.shape[axis] - 1))
     plane = np.take(volume.hu, index, axis=axis)
     spacing = np.delete(volume.grid.spacing, axis)
-    low, high = window
+    low, high = WINDOW_HU
     grey = np.clip((plane - low) / (high - low), 0, 1)
     picture = (255 * grey.T[::-1, ::-1]).astype(np.uint8)
     size = int(HEIGHT * plane.shape[0] * spacing[0] / (plane.shape[1] * spacing[1])), HEIGHT
     return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA))
 
 
-def animated(pictures: list[Array], milliseconds: int = 120) -> bytes:
+FRAME_MS = 120
+"""How long a picture stands."""
+
+
+def animated(pictures: list[Array]) -> bytes:
     """Animated WebP that runs there and back."""
     film = cv2.Animation()
     film.frames = [*pictures, *pictures[-2:0:-1]] if len(pictures) > 2 else pictures
-    film.durations = [milliseconds] * len(film.frames)
+    film.durations = [FRAME_MS] * len(film.frames)
     _, data = cv2.imencodeanimation(".webp", film, [cv2.IMWRITE_WEBP_QUALITY, 80])
     return np.asarray(data).tobytes()
 

@@ -51,12 +51,16 @@ def summarize(errors_mm: Array) -> TreStatistics:
     )
 
 
-def by_depth(errors_mm: Array, depth_mm: Array, edges_mm: tuple[float, ...] = (0.0, 10.0, 20.0, 30.0)) -> list[Stratum]:
+DEPTHS_MM = (0.0, 10.0, 20.0, 30.0)
+"""Between these depths errors are told apart."""
+
+
+def by_depth(errors_mm: Array, depth_mm: Array) -> list[Stratum]:
     """Errors by depth below the pleura; the first stratum also holds landmarks outside, the last everything deeper."""
-    bounds = np.array([-np.inf, *edges_mm[1:], np.inf])
+    bounds = np.array([-np.inf, *DEPTHS_MM[1:], np.inf])
     band = np.where(np.isfinite(depth_mm), np.digitize(depth_mm, bounds[1:-1]), -1)
-    named = [*edges_mm, np.inf]
-    return [Stratum(named[m], named[m + 1], summarize(np.asarray(errors_mm)[band == m])) for m in range(len(edges_mm))]
+    named = [*DEPTHS_MM, np.inf]
+    return [Stratum(named[m], named[m + 1], summarize(np.asarray(errors_mm)[band == m])) for m in range(len(DEPTHS_MM))]
 
 
 def signed_rank_p(before_mm: Array, after_mm: Array) -> float | None:

@@ -105,7 +105,7 @@ def _gain(hu: Array) -> float:
     return float(np.clip((SOFT_TISSUE_HU - np.median(airy)) / (SOFT_TISSUE_HU + 1000.0), 0.6, 1.2))
 
 
-def field_of_view(cbct: Volume, end_slices_mm: float = END_SLICES_MM) -> FieldOfView:
+def field_of_view(cbct: Volume) -> FieldOfView:
     """The cylinder in which the image is not constant; its axis is the voxel axis nearest to the patient's S."""
     axis = int(np.argmax(np.abs(cbct.grid.ras_from_ijk[2, :3]) / cbct.grid.spacing))
     plane = [m for m in range(3) if m != axis]
@@ -114,7 +114,7 @@ def field_of_view(cbct: Volume, end_slices_mm: float = END_SLICES_MM) -> FieldOf
     inside, centre, radius = _disc(hu, sx, sy)
     steps = hu.shape[2]
     lit = inside[:, :, None] & _lit_slices(hu, inside)[None, None, :]
-    ends = int(np.ceil(end_slices_mm / cbct.grid.spacing[axis] - 1e-6))
+    ends = int(np.ceil(END_SLICES_MM / cbct.grid.spacing[axis] - 1e-6))
     found = np.flatnonzero(lit.any(axis=(0, 1)))
     if found.size <= 2 * ends:
         raise InputRefused(

@@ -37,10 +37,14 @@ class Spine:
         return f"Spine(from {np.round(lo, 1)} to {np.round(hi, 1)} RAS mm, bone above {self.bone_hu:.0f} HU)"
 
 
-def segment_spine(image: Volume, usable: Mask | None = None, rim_mm: float = 3.0) -> Spine:
+RIM_MM = 3.0
+"""Soft tissue that is kept around bone."""
+
+
+def segment_spine(image: Volume, usable: Mask | None = None) -> Spine:
     """Spine of a CT or CBCT.
 
-    usable: voxels to trust (field of view without bad slices). rim_mm: soft tissue kept around bone.
+    usable: voxels to trust (field of view without bad slices).
     Raises InputRefused where no upright column of bone is seen. Ref: Alvarez 2021, section 6.1.1.
     """
     work = working_copy(image, SPACING_MM)
@@ -68,7 +72,7 @@ def segment_spine(image: Volume, usable: Mask | None = None, rim_mm: float = 3.0
             "upright column; check that the image holds the spine and its intensities are HU."
         )
     solid = close(vertebrae, 6.0, spacing)
-    mask = dilate(solid, rim_mm, spacing) & seen
+    mask = dilate(solid, RIM_MM, spacing) & seen
     centres = work.grid.to_ras(np.column_stack([path, slices]).astype(float))
     return Spine(on_grid(mask, work.grid, image.grid), centres, bone_hu)
 

@@ -56,13 +56,13 @@ class SurfacePoints:
         return SurfacePoints(self.points[keep], self.normals[keep], self.confidence[keep], self.border[keep])
 
 
-def deflated_surface(found: Pneumothorax, field: FieldOfView, spacing_mm: float = SPACING_MM) -> SurfacePoints:
-    """Surface of the collapsed lung where it was seen, about one point per `spacing_mm`, rim and bad slices left out.
+def deflated_surface(found: Pneumothorax, field: FieldOfView) -> SurfacePoints:
+    """Surface of the collapsed lung where it was seen, about one point per `SPACING_MM`, rim and bad slices left out.
 
     Air borders sit where HU crosses half-way between lung and air along the normal, fissures likewise (air with lung
     again within 22 mm); contact with wall, mediastinum or diaphragm is less sure, and dense lung least.
     """
-    points, normals = _on_mask(found.lung, spacing_mm)
+    points, normals = _on_mask(found.lung, SPACING_MM)
     points, normals = _seen(points, normals, field)
     gas = _membership(found.air, points + 2.0 * normals) > 0.5
     gas |= _membership(found.air, points + 1.0 * normals) > 0.5
@@ -76,12 +76,16 @@ def deflated_surface(found: Pneumothorax, field: FieldOfView, spacing_mm: float 
     return SurfacePoints(points + shift[:, None] * normals, normals, confidence, border)
 
 
-def diaphragm_points(space: Mask, image: Volume, field: FieldOfView, spacing_mm: float = 4.0) -> SurfacePoints:
+DIAPHRAGM_SPACING_MM = 4.0
+"""Between points of the diaphragm, about."""
+
+
+def diaphragm_points(space: Mask, image: Volume, field: FieldOfView) -> SurfacePoints:
     """Dome of the diaphragm where it is seen: the lower border of the lung's space against soft tissue.
 
     space: lung and pleural air. Normals point down, out of the space; an empty set when the field ends above the dome.
     """
-    points, normals = _on_mask(space, spacing_mm)
+    points, normals = _on_mask(space, DIAPHRAGM_SPACING_MM)
     points, normals = _seen(points, normals, field)
     outer = np.median(_along(image, points, normals, (4.0, 6.0, 8.0, 10.0)), axis=1)
     down = (normals[:, 2] < -0.5) & (outer > -200.0)

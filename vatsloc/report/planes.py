@@ -98,8 +98,12 @@ def section(surface: Surface, plane: Plane) -> Array:
     return np.stack(ends, axis=1)
 
 
-def ellipse(centre: Array, semi_axes: Array, plane: Plane, n: int = 72) -> Array | None:
-    """Closed curve (n, 2) of (column, row) in which the plane cuts an ellipsoid, None where it misses it.
+CORNERS = 72
+"""Of a drawn ellipse."""
+
+
+def ellipse(centre: Array, semi_axes: Array, plane: Plane) -> Array | None:
+    """Closed curve (CORNERS, 2) of (column, row) in which the plane cuts an ellipsoid, None where it misses it.
 
     centre: (3,) RAS mm; semi_axes: (3, 3), one per row, mm.
     """
@@ -114,6 +118,6 @@ def ellipse(centre: Array, semi_axes: Array, plane: Plane, n: int = 72) -> Array
     left = 1.0 - float(np.sum((d + b @ middle) ** 2))
     if left <= 0:
         return None
-    angle = np.linspace(0, 2 * np.pi, n, endpoint=False)
+    angle = np.linspace(0, 2 * np.pi, CORNERS, endpoint=False)
     circle = np.stack([np.cos(angle), np.sin(angle)])
     return middle + np.sqrt(left) * np.linalg.solve(np.linalg.cholesky(q).T, circle).T

@@ -21,10 +21,7 @@ class Choice:
         return asdict(self)
 
 
-def weigh(part: str, value: float, limit: float, seen: str, unit: str = "mm") -> Choice:
-    """Leave `part` out where value <= limit; what was not measured (NaN) keeps it. seen: says the value and of what;
-    unit: of both, "%" for a share.
-    """
-    allowed = f"{100 * limit:g} %" if unit == "%" else f"{limit:g} {unit}"
-    rule = "kept in every case" if limit < 0 else f"left out up to {allowed}"
+def weigh(part: str, value: float, limit: float, seen: str) -> Choice:
+    """Leave `part` out where value <= limit, mm; what was not measured (NaN) keeps it. seen: the value in words."""
+    rule = "kept in every case" if limit < 0 else f"left out up to {limit:g} mm"
     return Choice(part, not value <= limit, f"{seen}; {rule}", float(value), float(limit))
