@@ -17,6 +17,7 @@ from pydicom.uid import HTJ2KLossless, JPEGBaseline8Bit, RLELossless
 from tests.vatsloc.dicom_made import NK, compressed, ct_slice, enhanced, save
 from vatsloc.errors import InputRefused
 from vatsloc.formats.dicom import PADDING_HU
+from vatsloc.formats.dicom.pixels import _undecodable
 from vatsloc.formats.images import read_volume, read_volume_and_warnings
 
 T = gdcm.TransferSyntax
@@ -92,6 +93,14 @@ def test_bits_above_those_stored_are_refused(tmp_path):
     slices[1].PixelData = (np.frombuffer(slices[1].PixelData, "<u2") | 0x8000).tobytes()
     with pytest.raises(InputRefused, match=r"IM001 has pixels from 32768 to 36863, 0 to 4095 by its BitsStored"):
         read(tmp_path / "ct", slices)
+
+
+def test_of_what_a_decoder_said_the_last_line_is_told() -> None:
+    told = str(_undecodable(None, "tried two decoders:\nthe stream is cut short.\n", Path("IM7")))
+    assert told.startswith("IM7 has pixels that cannot be decoded")
+    assert ": the stream is cut short); export it" in told
+    assert "tried" not in told
+    assert "no reason given" in str(_undecodable(None, " \n", Path("IM7")))
 
 
 def test_unknown_compression_is_refused_with_its_name(tmp_path):

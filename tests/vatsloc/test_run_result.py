@@ -164,6 +164,16 @@ def test_the_nodule_is_drawn_once_where_the_deflated_image_has_it(
     assert volume == pytest.approx(4 / 3 * np.pi * radius**3, rel=0.25)
 
 
+def test_a_nodule_as_large_as_a_lobe_is_drawn_whole(found: Localization, ct_of_deflated: Array) -> None:
+    case, radius = known.scene().case, 36.0
+    large = known.ball(known.CT_GRID, known.NODULE_CT, radius)
+    mask = _nodule_mask(replace(case, nodule=replace(case.nodule, mask=large)), found)
+    lung = covered(found.collapse.mesh_after, known.DEFLATED_GRID).inside
+    far = np.linalg.norm(ct_of_deflated - known.NODULE_CT, axis=-1)
+    assert mask.inside[lung & (far < radius - 2.5)].all()
+    assert (lung & (far < radius - 2.5)).sum() > 200
+
+
 def test_each_state_of_the_lung_has_its_own_points_and_values(found: Localization, result: ResultData) -> None:
     ct = found.pose.mesh_ct.points
     inflated, before, deflated = known.INF_FROM_CT(ct), found.collapse.mesh_before.points, known.DEF_FROM_CT(ct)
