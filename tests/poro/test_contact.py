@@ -13,7 +13,16 @@ from shapes import box, compliance_of, ellipsoid
 
 from poro.arrays import Array
 from poro.collapse import Theta, assemble, solve
-from poro.contact import ChestWall, Compliance, ContactStatus, LevelSet, contact_sensitivity, level_set, solve_contact
+from poro.contact import (
+    ChestWall,
+    Compliance,
+    ContactStatus,
+    LevelSet,
+    active_set,
+    contact_sensitivity,
+    level_set,
+    solve_contact,
+)
 from poro.contact.active_set import LinearizedContact, linear_complementarity
 from poro.contact.geometric_stiffness import GeometricStiffness, geometric_stiffness
 from poro.contact.kkt import kkt_factor
@@ -197,6 +206,22 @@ def test_signorini_conditions_hold_on_a_curved_wall(hollow: tuple, density: floa
     assert_allclose(u[nodes], state.u, atol=1e-2)
     assert state.moves[-1] < 1e-3
     assert state.steps <= 12
+
+
+def test_on_the_way_contact_forces_press_and_never_pull(hollow: tuple, monkeypatch: pytest.MonkeyPatch) -> None:
+    mesh, body, nodes, wall, compliance = hollow
+    seen: list[Array] = []
+
+    def watched(compliance: Compliance, rest: Array, force: Array, hessian: Array) -> GeometricStiffness:
+        seen.append(force)
+        return geometric_stiffness(compliance, rest, force, hessian)
+
+    monkeypatch.setattr(active_set, "geometric_stiffness", watched)
+    free = body.solve(body_load(mesh, np.array([0, 0, -200.0 * GRAVITY_KPA_PER_MM])))[nodes]
+    state = solve_contact(compliance, wall, free, 4.0, tolerance_mm=1e-8)
+    assert len(seen) > 4
+    assert min(force.min() for force in seen) >= 0
+    assert min(force.sum() for force in seen[2:]) > 0.5 * state.force.sum()
 
 
 def test_contact_is_found_from_any_start(hollow: tuple) -> None:
