@@ -17,7 +17,7 @@ from vatsloc.errors import InputRefused
 from vatsloc.imaging.cbct import PreparedCbct, prepare_cbct
 from vatsloc.imaging.hilum import track_hilum
 from vatsloc.imaging.lungs import segment_lungs
-from vatsloc.imaging.pleura import Pneumothorax, _lung_beside, air_limit, find_pneumothorax
+from vatsloc.imaging.pleura import Pneumothorax, _large_pieces, _lung_beside, air_limit, find_pneumothorax
 from vatsloc.imaging.surface import Border, deflated_surface, diaphragm_points
 from vatsloc.imaging.thorax import ThoraxPrior, carry_prior, inflated_lung, require_share, visible_share
 
@@ -150,6 +150,17 @@ def test_a_lung_is_collapsed_where_both_air_and_contrast_reach_their_limit(
     found: Pneumothorax, air_ml: float, contrast_hu: float, collapsed: bool
 ) -> None:
     assert replace(found, air_ml=air_ml, contrast_hu=contrast_hu).is_collapsed is collapsed
+
+
+def test_air_is_kept_in_pieces_of_half_a_millilitre_that_lie_less_than_half_in_airways() -> None:
+    """Bars of 8, 8, 8 and 7 voxels of 1/16 ml: 3, 4 and no voxels of them in airways; the last one is too small."""
+    dark, tubes = np.zeros((2, 10, 10), bool), np.zeros((2, 10, 10), bool)
+    for row, (length, inside) in enumerate(((8, 3), (8, 4), (8, 0), (7, 0))):
+        dark[0, 2 * row, :length] = True
+        tubes[0, 2 * row, :inside] = True
+    kept = _large_pieces(dark, tubes, 1 / 16)
+    assert [bool(kept[0, 2 * row, 0]) for row in range(4)] == [True, False, True, False]
+    assert kept.sum() == 16
 
 
 def test_inflated_lung_is_not_called_collapsed(prior: ThoraxPrior) -> None:
