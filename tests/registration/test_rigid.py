@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from registration import spine
 from registration.maps.rigid import RigidTransform
-from registration.spine import RigidStatus, SpineSearch, _near_spine, register_spine
+from registration.spine import RigidStatus, SpineSearch, _near_spine, _refined, register_spine
 from registration.volume import Array, Grid, Mask, Volume
 from tests.registration.scenes import oriented
 
@@ -141,3 +144,27 @@ def test_places_near_a_spine_are_those_within_reach_of_a_voxel_of_it(height: int
     beside, beyond = np.array([-1.0, 0, 0]), np.array([0, 0, 1.0])
     points = np.stack([first + 29 * beside, first + 31 * beside, last + 29 * beyond, last + 31 * beyond])
     assert _near_spine(spine, points).tolist() == [True, False, True, False]
+
+
+def test_of_poses_refined_coarsely_the_best_distinct_ones_are_refined_finely(monkeypatch: pytest.MonkeyPatch) -> None:
+    """8 mm make a pose another one; at most so many are taken, and none without any correlation."""
+
+    def shifted(mm: float) -> RigidTransform:
+        return RigidTransform.about(np.zeros(3), np.zeros(3), np.array([mm, 0.0, 0.0]))
+
+    score = {0.0: 0.9, 5.0: 0.8, 20.0: 0.7, 40.0: 0.6, 60.0: -1.0}
+    poses = {mm: shifted(mm) for mm in score}
+    asked: list[tuple[object, float]] = []
+
+    def refine(level: object, pose: RigidTransform, _centre: Array, _steps: int) -> tuple[RigidTransform, float]:
+        mm = float(pose.matrix[0, 3])
+        asked.append((level, mm))
+        return pose, score[mm]
+
+    monkeypatch.setattr(spine, "_refine", refine)
+    levels: Any = ("coarse", "fine")
+    for most, kept in ((2, [0.0, 20.0]), (5, [0.0, 20.0, 40.0])):
+        asked.clear()
+        found = _refined(list(poses.values())[::-1], levels, np.zeros(3), most)
+        assert [ncc for _, ncc in found] == [score[mm] for mm in kept]
+        assert [mm for level, mm in asked if level == "fine"] == kept

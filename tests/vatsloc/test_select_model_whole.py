@@ -139,3 +139,13 @@ def test_without_a_refinement_the_plain_fit_stands_and_the_ensemble_says_how_sur
     assert known.asked["perturbation_ensemble"][2] is known.plain
     assert len(model.correspondences) == (0 if "keypoints" in skipped else len(pairs))
     assert len(NO_CORRESPONDENCES) == 0
+
+
+@pytest.mark.parametrize(("model", "tried"), [({}, True), ({"regional": False}, False)])
+def test_the_regional_fit_is_tried_unless_it_is_switched_off(
+    monkeypatch: pytest.MonkeyPatch, model: dict[str, bool], tried: bool
+) -> None:
+    known = Selection(monkeypatch, pairs_of())
+    monkeypatch.setattr(module, "_regional", lambda _settings: lambda m, t, s: knows(0.9)(m, t, s))
+    known.run(model=model)
+    assert ("regional fit" in known.stages.seconds) is tried
