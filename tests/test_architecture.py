@@ -43,7 +43,7 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         "frames": set(),
         "lazy": set(),
         "maps": set(),
-        "terminal": set(),
+        "terminal": {"navigation"},
         "formats": {"errors", "frames", "lazy"},
         "imaging": {"errors", "frames", "lazy"},
         "overlap": {"errors"},
