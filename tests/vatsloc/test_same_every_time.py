@@ -20,7 +20,7 @@ from vatsloc.synthetic.case import write_phantom
 
 ROOT = Path(__file__).parents[2]
 TIMED = ("seconds", "peak_mb", "peak_mb_by_stage")
-OF_PLACE = ("report.html", "scene_with_scans.mrml")
+OF_PLACE = ("report.html", "inputs.json", "scene_with_scans.mrml")
 """Files that tell seconds, or where the case lies."""
 
 
