@@ -11,6 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from registration.volume import Array, Mask
 from tests.vatsloc import ball_scene as scene
+from vatsloc.errors import InputRefused
 from vatsloc.imaging.hilum import Hilum
 from vatsloc.imaging.surface import Border
 from vatsloc.workflow import observe as module
@@ -183,6 +184,12 @@ def test_a_surface_by_hand_takes_the_place_of_the_found_one(watched: Watched) ->
     assert_allclose(by_hand.normals, np.concatenate([np.eye(3), -np.eye(3)]), atol=1e-9)
     assert_array_equal(by_hand.confidence, np.ones(6))
     assert set(by_hand.border) == {Border.AIR}
+
+
+def test_a_scan_that_shows_nothing_of_the_surface_is_refused(monkeypatch: pytest.MonkeyPatch, watched: Watched) -> None:
+    monkeypatch.setattr(module, "deflated_surface", lambda *_: watched.surface.where(np.zeros(50, bool)))
+    with pytest.raises(InputRefused, match="deflated CBCT shows nothing of the collapsed lung's surface; take"):
+        watched.observe(settings_of("balanced", COARSE))
 
 
 def test_held_nodes_are_those_within_the_radius_and_at_least_the_twelve_nearest() -> None:

@@ -12,6 +12,7 @@ from registration.maps.rigid import RigidTransform
 from registration.spine import RigidFit, register_spine
 from registration.volume import Array
 from vatsloc.case import Case
+from vatsloc.errors import InputRefused
 from vatsloc.imaging.hilum import Hilum, find_hilum
 from vatsloc.imaging.lattice import working_copy
 from vatsloc.imaging.pleura import Pneumothorax, find_pneumothorax
@@ -73,6 +74,11 @@ def observe(
         prior = _prior(prepared, pose, def_from_inf, case.side)
         found = find_pneumothorax(prepared.deflated, prior)
         surface = _hinted_surface(case) or deflated_surface(found, prepared.deflated.field)
+        if not surface.confidence.any():
+            raise InputRefused(
+                f"The {DEFLATED} shows nothing of the collapsed lung's surface; take a scan of the operated side after "
+                "the lung was let down, or give points of its surface in case.toml, [hints] deflated_surface."
+            )
     with stages.stage("hilum"):
         hilum_ct = find_hilum(prepared.lung_ct, prepared.lungs.airways, as_side(case.side))
         to_def = MeshMap(pose.mesh_ct, before.points, def_from_inf @ pose.inf_from_ct_rigid)
