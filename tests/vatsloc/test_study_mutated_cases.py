@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from vatsloc.cli import main
-from vatsloc.results import OF_INFLATED, OUTPUT_FILES
+from vatsloc.results import output_files
 from vatsloc.synthetic.case import write_phantom
 
 NUMBERS = range(*(int(n) for n in os.environ.get("VATSLOC_MUTATIONS", "0:200").split(":")))
@@ -250,7 +250,7 @@ def localized(case: Path, out: Path, settings: Path) -> int:
 @pytest.mark.study
 def test_the_case_is_answered_as_long_as_nothing_is_spoilt(whole: Path, tmp_path: Path) -> None:
     assert localized(whole, tmp_path / "result", tmp_path / "light.toml") in (0, 5)
-    assert sorted(path.name for path in (tmp_path / "result").iterdir()) == sorted(OUTPUT_FILES)
+    assert sorted(path.name for path in (tmp_path / "result").iterdir()) == sorted(output_files(True))
 
 
 @pytest.mark.study
@@ -275,8 +275,7 @@ def test_a_spoilt_case_ends_by_a_code_and_a_sentence_and_leaves_no_half_result(
     assert "not foreseen" not in told, f"{said}: {told}"
     if code in (0, 5):
         taken = json.loads((out / "run.json").read_text(encoding="utf-8"))["scans"]
-        left_out = () if "cbct_inflated" in taken else OF_INFLATED
-        assert sorted(path.name for path in out.iterdir()) == sorted(set(OUTPUT_FILES) - set(left_out)), said
+        assert sorted(path.name for path in out.iterdir()) == sorted(output_files("cbct_inflated" in taken)), said
     else:
         assert told.strip().splitlines()[-1].startswith("vatsloc: "), said
         assert not out.exists(), said
