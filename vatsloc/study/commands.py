@@ -117,7 +117,7 @@ def bench_cbct_command(
     seed: Annotated[int, typer.Option(metavar="N", help="Seed of the anatomy.")] = 0,
     as_json: JsonOption = False,
 ) -> None:
-    """The phantoms' cone-beam scanner in the image domain beside a C-arm's projections (extra "projections")."""
+    """The phantoms' cone-beam scanner in the image domain beside a C-arm's projections."""
     from vatsloc.study.bench.cbct import bench_cbct, table
 
     result = bench_cbct(name, seed, say)
