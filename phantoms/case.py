@@ -19,7 +19,7 @@ from phantoms.patient import Patient
 from phantoms.ports import draw_ports
 from phantoms.projection import Beat, expose_views, scene_grid
 from phantoms.recipes import SPECS
-from phantoms.size import body_units, resized, scaled, scanner_of_size
+from phantoms.size import body_units, scaled, scaled_region, scanner_of_size
 from phantoms.spec import PhantomSpec
 from phantoms.states import make_states
 from phantoms.thorax import Thorax, ct_grid, draw_lung_trees, draw_table, draw_thorax, image_body, operated_lung
@@ -91,7 +91,7 @@ def make_case(spec: PhantomSpec | str, seed: int = 0) -> PhantomCase:
     patient = thorax.patient
     table = make_states(patient, adult, rng)
     ct, body, ct_lung = _ct(thorax, patient, adult, rng)
-    return resized(finish_case(patient, adult, seed, table, (ct, body, ct_lung), _forks(patient), rng), spec)
+    return _resized(finish_case(patient, adult, seed, table, (ct, body, ct_lung), _forks(patient), rng), spec)
 
 
 def finish_case(
@@ -158,6 +158,35 @@ def _shoot(patient: Patient, body: Image, state: State, picture: Picture, shot: 
     beat = Beat(state.posed(state.motion(heart[None]))[0] * size, float(wall.mean()) * size, scanner.flaws.heart)
     return scaled(
         expose_views(scaled(scene, size), scaled(picture.clean, size).grid, scanner, rng, beat=beat), 1 / size
+    )
+
+
+def _resized(case: PhantomCase, spec: PhantomSpec) -> PhantomCase:
+    """A case in units of the person's size (see `body_units`) in mm, with the spec that it was made from."""
+    s = spec.size
+    if s == 1:
+        return case
+    regions = {name: scaled_region(m, s) for name, m in case.masks.items()}
+    info = {k: (np.array(v) * s).tolist() if k.endswith("_mm") else v for k, v in case.info.items()}
+    info["pose"] = [(np.array(pose) * np.array([1.0, 1.0, 1.0, s])).tolist() for pose in case.info["pose"]]
+    for pose in info["pose"]:
+        pose[3][3] = 1.0
+    return replace(
+        case,
+        spec=spec,
+        ct=scaled(case.ct, s),
+        cbct_inflated=scaled(case.cbct_inflated, s),
+        cbct_deflated=scaled(case.cbct_deflated, s),
+        nodule=scaled_region(case.nodule, s),
+        nodule_ct=case.nodule_ct * s,
+        nodule_inflated=case.nodule_inflated * s,
+        nodule_deflated=case.nodule_deflated * s,
+        landmarks_ct=case.landmarks_ct * s,
+        landmarks_inflated=case.landmarks_inflated * s,
+        landmarks_deflated=case.landmarks_deflated * s,
+        dense_truth=case.dense_truth * s,
+        masks=regions,
+        info=info,
     )
 
 

@@ -30,8 +30,8 @@ FADE_MM = 3.0
 @dataclass(frozen=True)
 class Look:
     """How a collapsed lung looks beside its shape. airless: on a lattice in the CT, 1 where tissue holds no gas, 0
-    where it does, or None; vessels: their radii over those in the CT; down, level: (3,) unit vector in the CT's frame and
-    mm along it, beyond which fluid fills what gas else would."""
+    where it does, or None; vessels: their radii over those in the CT; down, level: (3,) unit vector in the CT's frame
+    and mm along it, beyond which fluid fills what gas else would."""
 
     airless: Lattice | None = None
     vessels: float = 1.0
