@@ -109,8 +109,11 @@ def finish_case(
     view = patient.scanned_centre + spec.view
     grid = scanner_grid(view, spec.cbct_spacing, spec.scanner.length, spec.scanner.fov)
     grids = [_moved_grid(grid, s) for s in states]
-    pictures = [image_state(patient, body, s, g) for s, g in zip(states, grids, strict=True)]
-    shots = [_shoot(patient, body, s, p, Shot(spec, gravity, rng)) for s, p in zip(states, pictures, strict=True)]
+    scenes = [scene_grid(g) if spec.scanner.domain == "projection" else g for g in grids]
+    pictures = [image_state(patient, body, s, g) for s, g in zip(states, scenes, strict=True)]
+    shot = Shot(spec, gravity, rng)
+    shots = [_shoot(p, g, patient, s, shot) for p, g, s in zip(pictures, grids, states, strict=True)]
+    pictures = [_seen_on(g, p) for g, p in zip(grids, pictures, strict=True)]
     nodule = nodule_mask(patient.nodule, ct.grid)
     nodule_points = [_nodule_centre(patient.nodule, s) for s in states]
     ct_marks = _landmarks(places, states, grids, spec.scanner.fov, rng)
@@ -143,22 +146,34 @@ def finish_case(
     )
 
 
-def _shoot(patient: Patient, body: Image, state: State, picture: Picture, shot: Shot) -> Image:
+def _shoot(picture: Picture, view: Grid, patient: Patient, state: State, shot: Shot) -> Image:
     """Cone-beam CT of a state, in the domain that the scanner is simulated in. The scanner works in true mm."""
     spec, rng = shot.spec, shot.rng
     size, scanner = spec.size, scanner_of_size(spec.scanner, spec.size)
     if scanner.domain == "image":
         return scaled(expose(scaled(picture.clean, size), scanner, rng), 1 / size)
-    grid = picture.clean.grid
-    around = scene_grid(grid)
-    scene = image_state(patient, body, state, around).clean
     if not state.held:
-        draw_ports(scene, state, scanner.flaws.ports, -shot.gravity, rng)
+        draw_ports(picture.clean, state, scanner.flaws.ports, -shot.gravity, rng)
     heart, wall = patient.build.heart
     beat = Beat(state.posed(state.motion(heart[None]))[0] * size, float(wall.mean()) * size, scanner.flaws.heart)
-    return scaled(
-        expose_views(scaled(scene, size), scaled(picture.clean, size).grid, scanner, rng, beat=beat), 1 / size
-    )
+    grid = scaled(Image(np.zeros(view.shape, dtype=bool), view.ras_from_ijk), size).grid
+    return scaled(expose_views(scaled(picture.clean, size), grid, scanner, rng, beat=beat), 1 / size)
+
+
+def _seen_on(view: Grid, picture: Picture) -> Picture:
+    """The picture with its masks on the voxels of a view."""
+    if picture.clean.grid.shape == view.shape:
+        return picture
+    step = picture.clean.grid.spacing
+    index = [
+        np.arange(n) * h / s + off
+        for n, h, s, off in zip(
+            view.shape, view.spacing, step, picture.clean.grid.to_ijk(view.to_ras(np.zeros(3))), strict=True
+        )
+    ]
+    nearest = np.ix_(*(np.rint(i).astype(int) for i in index))
+    lung, nodule = (Region(m.inside[nearest], view.ras_from_ijk) for m in (picture.lung, picture.nodule))
+    return replace(picture, lung=lung, nodule=nodule)
 
 
 def _resized(case: PhantomCase, spec: PhantomSpec) -> PhantomCase:

@@ -45,7 +45,8 @@ class Circle:
 
 
 def project(volume: Array, spacing: Array, circle: Circle, levels: Array, middle_mm: Array | None = None) -> Array:
-    """Line integrals (m, views, columns, rows) of by how much `volume` [i, j, k] per mm exceeds each of m `levels`.
+    """Line integrals (m, views, columns, rows) of by how much `volume` [i, j, k] per mm exceeds each of m `levels`, the
+    lowest first.
 
     middle_mm: (3,) middle of the volume from the axis and the plane of the circle, default none.
     """
@@ -136,39 +137,42 @@ def _project(volume, origin, h, reach, angles, detector, levels, out):
 
 @numba.njit(cache=True, fastmath=True)
 def _view(volume, origin, h, reach, angle, detector, levels, out):
-    ni, nj, nk = volume.shape
     columns, rows = detector
     c, s = np.cos(angle), np.sin(angle)
-    line = np.zeros(nk, dtype=np.float32)
+    source = (reach[0] * c, reach[0] * s)
+    line, values = np.zeros(volume.shape[2], dtype=np.float32), np.zeros(len(rows), dtype=np.float32)
+    # Plane by plane, so that what is read of the volume lies together.
+    for axis in (0, 1):
+        for n in range(volume.shape[axis]):
+            for column in range(len(columns)):
+                ray = (-reach[1] * c - columns[column] * s, -reach[1] * s + columns[column] * c)
+                if (abs(ray[0]) >= abs(ray[1])) != (axis == 0):
+                    continue
+                t = (origin[axis] + h[axis] * n - source[axis]) / ray[axis]
+                at = (source[1 - axis] + t * ray[1 - axis] - origin[1 - axis]) / h[1 - axis]
+                if at < 0 or at >= volume.shape[1 - axis] - 1 or t <= 0:
+                    continue
+                m = int(at)
+                f = np.float32(at - m)
+                if axis == 0:
+                    most = _blend(line, volume[n, m], volume[n, m + 1], np.float32(1) - f, f)
+                else:
+                    most = _blend(line, volume[m, n], volume[m + 1, n], np.float32(1) - f, f)
+                if most <= levels[0]:
+                    continue
+                start = (t * rows[0] - origin[2]) / h[2]
+                rise = t * (rows[1] - rows[0]) / h[2]
+                first = max(int(np.ceil(-start / rise)), 0)
+                end = min(int(np.ceil((len(line) - 1 - start) / rise)), len(rows))
+                _gather(line, np.float32(start), np.float32(rise), first, end, values)
+                for level in range(len(levels)):
+                    if most > levels[level]:
+                        _exceeding(values, first, end, levels[level], out[level, column])
     for column in range(len(columns)):
-        dx = -reach[1] * c - columns[column] * s
-        dy = -reach[1] * s + columns[column] * c
-        along_x = abs(dx) >= abs(dy)
-        for n in range(ni if along_x else nj):
-            if along_x:
-                t = (origin[0] + h[0] * n - reach[0] * c) / dx
-                at, last = (reach[0] * s + t * dy - origin[1]) / h[1], nj - 1
-            else:
-                t = (origin[1] + h[1] * n - reach[0] * s) / dy
-                at, last = (reach[0] * c + t * dx - origin[0]) / h[0], ni - 1
-            if at < 0 or at >= last or t <= 0:
-                continue
-            m = int(at)
-            f = np.float32(at - m)
-            if along_x:
-                most = _blend(line, volume[n, m], volume[n, m + 1], np.float32(1) - f, f)
-            else:
-                most = _blend(line, volume[m, n], volume[m + 1, n], np.float32(1) - f, f)
-            start = (t * rows[0] - origin[2]) / h[2]
-            rise = t * (rows[1] - rows[0]) / h[2]
-            first = max(int(np.ceil(-start / rise)), 0)
-            end = min(int(np.ceil((nk - 1 - start) / rise)), len(rows))
-            for level in range(len(levels)):
-                if most > levels[level]:
-                    _gather(line, np.float32(start), np.float32(rise), first, end, levels[level], out[level, column])
+        dx, dy = -reach[1] * c - columns[column] * s, -reach[1] * s + columns[column] * c
+        along = h[0] / abs(dx) if abs(dx) >= abs(dy) else h[1] / abs(dy)
         for row in range(len(rows)):
-            slant = np.sqrt(dx * dx + dy * dy + rows[row] ** 2)
-            out[:, column, row] *= np.float32(slant * (h[0] / abs(dx) if along_x else h[1] / abs(dy)))
+            out[:, column, row] *= np.float32(np.sqrt(dx * dx + dy * dy + rows[row] ** 2) * along)
 
 
 @numba.njit(cache=True, fastmath=True)
@@ -183,14 +187,22 @@ def _blend(line, a, b, f, g):
 
 
 @numba.njit(cache=True, fastmath=True)
-def _gather(line, start, rise, first, end, level, sums):
-    """Add to every row from `first` to `end` by how much the line at start + rise * row exceeds a level."""
-    last = np.int32(len(line) - 2)
-    for row in range(first, end):
-        z = start + rise * np.float32(row)
-        k = min(max(np.int32(z), np.int32(0)), last)
-        value = line[k] + (z - np.float32(k)) * (line[k + 1] - line[k])
-        sums[row] += max(value - level, np.float32(0))
+def _gather(line, start, rise, first, end, values):
+    """Values of a line at start + rise * n for every n from `first` to `end`, all of which lie on it."""
+    last = np.uint64(len(line) - 2)
+    for n in range(first, end):
+        at = max(start + rise * np.float32(n), np.float32(0))
+        # An unsigned index spares the test for one that counts from the end.
+        k = min(np.uint64(np.int32(at)), last)
+        share = at - np.float32(k)
+        values[n] = line[k] * (np.float32(1) - share) + line[k + np.uint64(1)] * share
+
+
+@numba.njit(cache=True, fastmath=True)
+def _exceeding(values, first, end, level, sums):
+    """Add to sums by how much values from `first` to `end` exceed a level."""
+    for n in range(first, end):
+        sums[n] += max(values[n] - level, np.float32(0))
 
 
 @numba.njit(cache=True, parallel=True)
@@ -204,8 +216,7 @@ def _backproject(filtered, origin, h, reach, angles, detector, out):
 def _slab(filtered, x, origin, h, reach, turns, detector, out):
     views, columns, rows = filtered.shape
     u0, v0, pixel, beta = detector
-    line = np.zeros(rows, dtype=np.float32)
-    last = np.int32(rows - 2)
+    line, values = np.zeros(rows, dtype=np.float32), np.zeros(out.shape[1], dtype=np.float32)
     for view in range(views):
         c, s = turns[0][view], turns[1][view]
         for j in range(len(out)):
@@ -223,8 +234,6 @@ def _slab(filtered, x, origin, h, reach, turns, detector, out):
             rise = scale * h[2] / pixel
             first = max(int(np.ceil(-start / rise)), 0)
             end = min(int(np.ceil((rows - 1 - start) / rise)), out.shape[1])
-            low, step = np.float32(start), np.float32(rise)
+            _gather(line, np.float32(start), np.float32(rise), first, end, values)
             for k in range(first, end):
-                v = low + step * np.float32(k)
-                n = min(max(np.int32(v), np.int32(0)), last)
-                out[j, k] += line[n] + (v - np.float32(n)) * (line[n + 1] - line[n])
+                out[j, k] += values[k]
