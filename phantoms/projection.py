@@ -28,6 +28,8 @@ ENERGIES = np.array([0.30, 0.45, 0.25])
 """Shares of a beam's photons at 45, 65 and 95 keV."""
 HARDER = np.array([[1.22, 1.00, 0.87], [1.85, 1.00, 0.69], [2.70, 1.00, 0.42]])
 """Attenuation of water, bone and steel at these over that at 65 keV."""
+MOST_SCATTER = 0.7
+"""Share of a pixel's counts that the correction takes for scatter at most. Ref: Siewerdsen et al. 2006."""
 THIN = 4
 """Scatter is smooth, and computed on every so many pixels."""
 
@@ -172,8 +174,10 @@ def detect(paths: Array, arm: CArm, rng: np.random.Generator) -> Array:
     primary = open_view * _transmitted(paths, arm)
     lost = primary * np.maximum(paths[0], 0)
     counts = rng.poisson(primary + arm.scattered * _spread(lost, arm.spread / arm.pixel)).astype(np.float32)
-    # The correction knows how much is scattered but for a part, and spreads it further than it is.
-    counts -= (arm.scattered - arm.scatter) * _spread(lost, 1.5 * arm.spread / arm.pixel)
+    # The correction knows how much is scattered but for a part, and spreads it further than it is; it takes no more of
+    # a pixel's counts than can be scatter.
+    believed = (arm.scattered - arm.scatter) * _spread(lost, 1.5 * arm.spread / arm.pixel)
+    counts -= np.minimum(believed, MOST_SCATTER * counts)
     read = -np.log(np.maximum(counts, 1.0) / open_view)
     if not arm.hardening:
         return np.asarray(read, dtype=np.float32)
