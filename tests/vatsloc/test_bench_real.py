@@ -176,7 +176,7 @@ def write_chest(folder: Path) -> Path:
         nib.save(nib.Nifti1Image(inside.astype(np.uint8), affine), folder / f"right_lung_{name}.nii.gz")
     marks = np.array([[60.0, 0.0, 0.0], [70.0, 20.0, -30.0], [55.0, -20.0, 30.0]])
     rows = np.hstack([marks, (marks - centre) @ matrix.T + centre + shift])
-    header = "insp_x,insp_y,insp_z,exp_x,exp_y,exp_z"
+    header = "first_x,first_y,first_z,second_x,second_y,second_z"
     np.savetxt(folder / LANDMARKS, rows, delimiter=",", header=header, comments="")
     return folder
 

@@ -19,6 +19,8 @@ from vatsloc.formats.guard import reading
 from vatsloc.imaging.lungs import Side
 
 _COLUMNS = ["insp_x", "insp_y", "insp_z", "exp_x", "exp_y", "exp_z"]
+_OTHER_COLUMNS = ["first_x", "first_y", "first_z", "second_x", "second_y", "second_z"]
+"""The same, in the words of folders that call their states first and second."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +77,7 @@ def read_person(folder: Path, edge_mm: float = EDGE_MM) -> Person:
 def _landmarks(path: Path) -> Array:
     with reading(path, "table of numbers", "write six numbers per line"):
         lines = path.read_text(encoding="utf-8-sig").splitlines()
-    if not lines or [name.strip() for name in lines[0].split(",")] != _COLUMNS:
+    if not lines or [name.strip() for name in lines[0].split(",")] not in (_COLUMNS, _OTHER_COLUMNS):
         raise CaseError(f"{path} starts with {lines[0] if lines else 'nothing'!r}; write {','.join(_COLUMNS)}.")
     try:
         points = np.array([[float(value) for value in line.split(",")] for line in lines[1:] if line.strip()])

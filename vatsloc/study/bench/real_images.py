@@ -9,10 +9,9 @@ import numpy as np
 
 from poro.breathing.elastic import Lung
 from poro.mesh import interpolate, locate
-from registration.images.morphology import dilate
 from registration.images.resample import coarsen, resample_mask
 from registration.maps.field import PointMap
-from registration.sliding import BEYOND_MM, masked, register_sliding
+from registration.sliding import LungImage, beyond_the_wall, masked, register_sliding
 from registration.volume import Array, Mask, Volume
 from vatsloc.breathing.case import BreathCase
 from vatsloc.breathing.lungs import Pair
@@ -49,14 +48,15 @@ def registered(
     assert rest is not None
     points = tissue(pair.inspired)
     say(f"{case.name}, {pair.side} lung: there ...")
-    exp_from_insp = moving_from_fixed((full, pair.inspired), (rest, pair.expired))
+    inspired, expired = (lung_image(scan, lung) for scan, lung in ((full, pair.inspired), (rest, pair.expired)))
+    exp_from_insp = moving_from_fixed(inspired, expired)
     say(f"{case.name}, {pair.side} lung: back ...")
-    insp_from_exp = moving_from_fixed((rest, pair.expired), (full, pair.inspired))
+    insp_from_exp = moving_from_fixed(expired, inspired)
     there = exp_from_insp(points)
     columns = {"there_and_back": distances(insp_from_exp(there), points), "motion": distances(there, points)}
     if elastix_version() is not None:
         say(f"{case.name}, {pair.side} lung: elastix ...")
-        columns["elastix"] = distances(_peer((full, pair.inspired), (rest, pair.expired))(points), there)
+        columns["elastix"] = distances(_peer(inspired, expired)(points), there)
     depth = depth_below_pleura(pair.lung.inspired, points)
     agreed = columns["there_and_back"] <= AGREED_MM
     return {
@@ -78,20 +78,21 @@ def tissue(lung: Mask, count: int = POINTS) -> Array:
     return lung.grid.to_ras(chosen + rng.uniform(-0.5, 0.5, chosen.shape))
 
 
-def moving_from_fixed(fixed: tuple[Volume, Mask], moving: tuple[Volume, Mask]) -> PointMap:
+def lung_image(scan: Volume, lung: Mask) -> LungImage:
+    """An image with the lung in it, on its own voxels."""
+    return LungImage(scan, resample_mask(lung, scan.grid))
+
+
+def moving_from_fixed(fixed: LungImage, moving: LungImage) -> PointMap:
     """The map of a lung that slides on its wall, as phase 1 finds it, from where both images lie."""
-    fixed_lung, moving_lung = (resample_mask(lung, image.grid) for image, lung in (fixed, moving))
-    settings = ffd_settings(Settings().registration)
-    return register_sliding(fixed[0], moving[0], moving_lung, settings, fixed_lung=fixed_lung).moving_from_fixed
+    return register_sliding(fixed, moving, ffd_settings(Settings().registration)).moving_from_fixed
 
 
-def _peer(fixed: tuple[Volume, Mask], moving: tuple[Volume, Mask]) -> PointMap:
+def _peer(fixed: LungImage, moving: LungImage) -> PointMap:
     """The same by elastix, of images masked outside the lung."""
-    coarse = [coarsen(image, PEER_VOXEL_MM) for image, _ in (fixed, moving)]
-    lungs = [resample_mask(lung, image.grid) for image, (_, lung) in zip(coarse, (fixed, moving), strict=True)]
-    region = Mask(dilate(lungs[0].inside, BEYOND_MM, lungs[0].grid.spacing), lungs[0].ras_from_ijk)
-    images = [masked(image, lung) for image, lung in zip(coarse, lungs, strict=True)]
-    return run_elastix(images[0], images[1], region, ElastixSettings()).moving_from_fixed
+    fixed, moving = (lung_image(coarsen(of.volume, PEER_VOXEL_MM), of.lung) for of in (fixed, moving))
+    images = (masked(of.volume, of.lung) for of in (fixed, moving))
+    return run_elastix(*images, beyond_the_wall(fixed), ElastixSettings()).moving_from_fixed
 
 
 def carried(lung: Lung, nodes: Array, points: Array) -> Array:
