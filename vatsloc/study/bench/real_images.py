@@ -91,8 +91,8 @@ def moving_from_fixed(fixed: LungImage, moving: LungImage) -> PointMap:
 def _peer(fixed: LungImage, moving: LungImage) -> PointMap:
     """The same by elastix, of images masked outside the lung."""
     fixed, moving = (lung_image(coarsen(of.volume, PEER_VOXEL_MM), of.lung) for of in (fixed, moving))
-    images = (masked(of.volume, of.lung) for of in (fixed, moving))
-    return run_elastix(*images, beyond_the_wall(fixed), ElastixSettings()).moving_from_fixed
+    images = masked(fixed.volume, fixed.lung), masked(moving.volume, moving.lung)
+    return run_elastix(images[0], images[1], beyond_the_wall(fixed), ElastixSettings()).moving_from_fixed
 
 
 def carried(lung: Lung, nodes: Array, points: Array) -> Array:
