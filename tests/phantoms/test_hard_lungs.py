@@ -132,6 +132,11 @@ def test_diseases_fill_their_shares_and_change_density_there_only() -> None:
         assert abs(change[share < 0.01]).mean() < 6
 
 
+def test_a_healthy_lung_is_left_as_it_is(demo: PhantomCase) -> None:
+    tissue = demo.patient.parenchyma
+    assert diseased(tissue, demo.patient.lung, Disease(), 3) is tissue
+
+
 def test_patches_fill_the_share_asked_for(demo: PhantomCase) -> None:
     lung = demo.patient.lung
     for share in (0.0, 0.2, 0.6):
