@@ -36,7 +36,7 @@ def _height(lung: Lattice) -> Array:
 
 
 def diseased(parenchyma: Lattice, lung: Lattice, disease: Disease, seed: int) -> Lattice:
-    """Densities (HU) of a lung's tissue with its diseases: holes with thin walls, and a net of scars; none leaves it."""
+    """Densities (HU) of a lung's tissue with its diseases: holes with thin walls, a net of scars; none leaves it."""
     if disease == Disease():
         return parenchyma
     hu = parenchyma.values.copy()
