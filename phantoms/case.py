@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from phantoms.cbct import Scanner, expose, scanner_grid
+from phantoms.cbct import expose, scanner_grid
+from phantoms.disease import diseased
 from phantoms.fields import coverage
 from phantoms.imaging import Picture, State, image_state
 from phantoms.measures import measure
 from phantoms.nodule import Nodule, nodule_mask, paint_nodule
 from phantoms.patient import Patient
-from phantoms.projection import expose_views, scene_grid
-from phantoms.spec import SPECS, PhantomSpec
+from phantoms.ports import draw_ports
+from phantoms.projection import Beat, expose_views, scene_grid
+from phantoms.recipes import SPECS
+from phantoms.size import body_units, scaled, scaled_region, scanner_of_size
+from phantoms.spec import PhantomSpec
 from phantoms.states import make_states
-from phantoms.thorax import Thorax, ct_grid, draw_lung_trees, draw_table, draw_thorax, image_body
+from phantoms.thorax import Thorax, ct_grid, draw_lung_trees, draw_table, draw_thorax, image_body, operated_lung
 from phantoms.tissue import Equilibrium
 from phantoms.voxels import Grid, Image, Region
 
@@ -32,7 +36,8 @@ class PhantomCase:
     """A case and its truth. Images in HU; points in RAS mm of their own image's frame.
 
     gravity_cbct: (3,) unit vector in the frame of the CBCTs; landmarks: (n, 3); dense_truth: (n, 9) in the CT, inflated
-    and deflated; patient: the person; inflated, deflated: the states, which give the map at any point.
+    and deflated; patient: the person; inflated, deflated: the states, which give the map at any point, in mm of a
+    person of adult size.
     """
 
     spec: PhantomSpec
@@ -57,6 +62,15 @@ class PhantomCase:
     info: dict[str, Any]
 
 
+@dataclass(frozen=True)
+class Shot:
+    """What the scanner needs to know beside the scene. gravity: (3,) unit vector in the frame of the CT."""
+
+    spec: PhantomSpec
+    gravity: Array
+    rng: np.random.Generator
+
+
 def make_case(spec: PhantomSpec | str, seed: int = 0) -> PhantomCase:
     """The case of a spec, or of a name in `SPECS`; equal seeds give equal cases."""
     if isinstance(spec, str):
@@ -67,12 +81,17 @@ def make_case(spec: PhantomSpec | str, seed: int = 0) -> PhantomCase:
         raise ValueError(f"side must be 'right' or 'left', got {spec.side!r}")
     if spec.scanner.domain not in ("image", "projection"):
         raise ValueError(f"the scanner's domain must be 'image' or 'projection', got {spec.scanner.domain!r}")
+    if spec.lesion.seen not in ("all", "ct and inflated", "ct"):
+        raise ValueError(f"a lesion is seen in 'all', 'ct and inflated' or 'ct', got {spec.lesion.seen!r}")
     rng = np.random.default_rng([seed, 11])
-    thorax = draw_thorax(spec.side, spec.habitus, spec.lesion, seed, spec.fused)
+    adult = body_units(spec)
+    thorax = draw_thorax(spec.side, spec.habitus, adult.lesion, seed, spec.fused)
+    ill = diseased(thorax.parenchyma, operated_lung(thorax.shapes, spec.side), spec.disease, seed)
+    thorax = replace(thorax, parenchyma=ill)
     patient = thorax.patient
-    table = make_states(patient, spec, rng)
-    ct, body, ct_lung = _ct(thorax, patient, spec, rng)
-    return finish_case(patient, spec, seed, table, (ct, body, ct_lung), _forks(patient), rng)
+    table = make_states(patient, adult, rng)
+    ct, body, ct_lung = _ct(thorax, patient, adult, rng)
+    return _resized(finish_case(patient, adult, seed, table, (ct, body, ct_lung), _forks(patient), rng), spec)
 
 
 def finish_case(
@@ -90,8 +109,11 @@ def finish_case(
     view = patient.scanned_centre + spec.view
     grid = scanner_grid(view, spec.cbct_spacing, spec.scanner.length, spec.scanner.fov)
     grids = [_moved_grid(grid, s) for s in states]
-    pictures = [image_state(patient, body, s, g) for s, g in zip(states, grids, strict=True)]
-    shots = [_shoot(patient, body, s, p, spec.scanner, rng) for s, p in zip(states, pictures, strict=True)]
+    scenes = [scene_grid(g) if spec.scanner.domain == "projection" else g for g in grids]
+    pictures = [image_state(patient, body, s, g) for s, g in zip(states, scenes, strict=True)]
+    shot = Shot(spec, gravity, rng)
+    shots = [_shoot(p, g, patient, s, shot) for p, g, s in zip(pictures, grids, states, strict=True)]
+    pictures = [_seen_on(g, p) for g, p in zip(grids, pictures, strict=True)]
     nodule = nodule_mask(patient.nodule, ct.grid)
     nodule_points = [_nodule_centre(patient.nodule, s) for s in states]
     ct_marks = _landmarks(places, states, grids, spec.scanner.fov, rng)
@@ -124,14 +146,63 @@ def finish_case(
     )
 
 
-def _shoot(
-    patient: Patient, body: Image, state: State, picture: Picture, scanner: Scanner, rng: np.random.Generator
-) -> Image:
-    """Cone-beam CT of a state, in the domain that the scanner is simulated in."""
+def _shoot(picture: Picture, view: Grid, patient: Patient, state: State, shot: Shot) -> Image:
+    """Cone-beam CT of a state, in the domain that the scanner is simulated in. The scanner works in true mm."""
+    spec, rng = shot.spec, shot.rng
+    size, scanner = spec.size, scanner_of_size(spec.scanner, spec.size)
     if scanner.domain == "image":
-        return expose(picture.clean, scanner, rng)
-    grid = picture.clean.grid
-    return expose_views(image_state(patient, body, state, scene_grid(grid)).clean, grid, scanner, rng)
+        return scaled(expose(scaled(picture.clean, size), scanner, rng), 1 / size)
+    if not state.held:
+        draw_ports(picture.clean, state, scanner.flaws.ports, -shot.gravity, rng)
+    heart, wall = patient.build.heart
+    beat = Beat(state.posed(state.motion(heart[None]))[0] * size, float(wall.mean()) * size, scanner.flaws.heart)
+    grid = scaled(Image(np.zeros(view.shape, dtype=bool), view.ras_from_ijk), size).grid
+    return scaled(expose_views(scaled(picture.clean, size), grid, scanner, rng, beat=beat), 1 / size)
+
+
+def _seen_on(view: Grid, picture: Picture) -> Picture:
+    """The picture with its masks on the voxels of a view."""
+    if picture.clean.grid.shape == view.shape:
+        return picture
+    step = picture.clean.grid.spacing
+    index = [
+        np.arange(n) * h / s + off
+        for n, h, s, off in zip(
+            view.shape, view.spacing, step, picture.clean.grid.to_ijk(view.to_ras(np.zeros(3))), strict=True
+        )
+    ]
+    nearest = np.ix_(*(np.rint(i).astype(int) for i in index))
+    lung, nodule = (Region(m.inside[nearest], view.ras_from_ijk) for m in (picture.lung, picture.nodule))
+    return replace(picture, lung=lung, nodule=nodule)
+
+
+def _resized(case: PhantomCase, spec: PhantomSpec) -> PhantomCase:
+    """A case in units of the person's size (see `body_units`) in mm, with the spec that it was made from."""
+    s = spec.size
+    if s == 1:
+        return case
+    regions = {name: scaled_region(m, s) for name, m in case.masks.items()}
+    info = {k: (np.array(v) * s).tolist() if k.endswith("_mm") else v for k, v in case.info.items()}
+    info["pose"] = [(np.array(pose) * np.array([1.0, 1.0, 1.0, s])).tolist() for pose in case.info["pose"]]
+    for pose in info["pose"]:
+        pose[3][3] = 1.0
+    return replace(
+        case,
+        spec=spec,
+        ct=scaled(case.ct, s),
+        cbct_inflated=scaled(case.cbct_inflated, s),
+        cbct_deflated=scaled(case.cbct_deflated, s),
+        nodule=scaled_region(case.nodule, s),
+        nodule_ct=case.nodule_ct * s,
+        nodule_inflated=case.nodule_inflated * s,
+        nodule_deflated=case.nodule_deflated * s,
+        landmarks_ct=case.landmarks_ct * s,
+        landmarks_inflated=case.landmarks_inflated * s,
+        landmarks_deflated=case.landmarks_deflated * s,
+        dense_truth=case.dense_truth * s,
+        masks=regions,
+        info=info,
+    )
 
 
 def _moved_grid(grid: Grid, state: State) -> Grid:

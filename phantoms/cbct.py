@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -17,11 +17,25 @@ OUTSIDE_HU = -1000.0
 
 
 @dataclass(frozen=True)
+class Flaws:
+    """What is wrong with a C-arm's scan. scatter: share of the photons lost by a ray that its correction leaves, below
+    zero where it takes off too many; heart: mm that the heart's wall moves by while it beats; ports: steel trocars in
+    the wall when the lung is collapsed; gain, offset: an image of the density d (HU) reads
+    gain * (d + 1000) - 1000 + offset."""
+
+    scatter: float = 0.03
+    heart: float = 5.0
+    ports: int = 0
+    gain: float = 1.0
+    offset: float = 0.0
+
+
+@dataclass(frozen=True)
 class Scanner:
     """Cone-beam scanner. fov: mm diameter; length: mm it shows along the patient; blur: mm standard deviation;
     cupping: share of the signal lost in the middle; rim: share gained at the edge of the field of view; noise: HU;
     end: mm of bad slices at either end; domain: "image" for artefacts of those sizes, "projection" for a C-arm of that
-    field of view and dose, which has its own."""
+    field of view and dose with its own artefacts; flaws: of the latter."""
 
     fov: float = 240.0
     length: float = 170.0
@@ -31,6 +45,7 @@ class Scanner:
     noise: float = 21.0
     end: float = 12.0
     domain: str = "image"
+    flaws: Flaws = field(default_factory=Flaws)
 
 
 def scanner_grid(centre: Array, spacing: tuple[float, float, float], length_mm: float, fov_mm: float = 240.0) -> Grid:

@@ -103,6 +103,16 @@ def smooth_noise(lattice: Lattice, length_mm: float, rng: np.random.Generator) -
     return (fine - fine.mean()) / fine.std()
 
 
+def patches(region: Lattice, share: float, length_mm: float, rng: np.random.Generator, bias: Array) -> Lattice:
+    """One in patches that fill a `share` of a region (signed distance, mm), zero between, smooth over a short way.
+
+    length_mm: correlation length; bias: on the lattice, what makes a patch likelier, in deviations of the noise.
+    """
+    value = smooth_noise(region, length_mm, rng) + bias
+    edge = np.quantile(value[region.values < 0], 1 - share) if share > 0 else np.inf
+    return region.like(smoothstep(value, edge - 0.06, edge + 0.06) if share > 0 else np.zeros(value.shape))
+
+
 def smoothstep(x: Array, low: float, high: float) -> Array:
     """Zero below `low`, one above `high`, cubic between."""
     t = np.clip((x - low) / (high - low), 0, 1)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 from phantoms.cage import CageMotion
 from phantoms.fields import Lattice, coverage, refine, smoothstep
 from phantoms.lobes import LobedMap
+from phantoms.nodule import PLAIN_HU
 from phantoms.patient import Patient
 from phantoms.spline import SplineMap
 from phantoms.thorax import draw_lung_trees
@@ -21,13 +22,29 @@ from phantoms.voxels import Grid, Image, Region
 
 Array = NDArray[Any]
 PLEURAL_AIR_HU = -998.0
+AIRLESS_HU, FLUID_HU = 28.0, 12.0
+FADE_MM = 3.0
+"""Standard deviation of the blur in which vessels of scanned tissue fade."""
+
+
+@dataclass(frozen=True)
+class Look:
+    """How a collapsed lung looks beside its shape. airless: on a lattice in the CT, 1 where tissue holds no gas, 0
+    where it does, or None; vessels: their radii over those in the CT; down, level: (3,) unit vector in the CT's frame
+    and mm along it, beyond which fluid fills what gas else would."""
+
+    airless: Lattice | None = None
+    vessels: float = 1.0
+    down: Array | None = None
+    level: float = np.inf
 
 
 @dataclass(frozen=True)
 class State:
     """A thorax on the table. lung: operated lung in the CT; cavity: its room in the state, both signed distances (mm);
     motion: CT to the state for the walls; lung_map: CT to the state for the operated lung; held: whether the lung fills
-    its room; pose: (4, 4), frame of the state's image from that of the CT; samples: (n, 3) mm in the lung in the CT."""
+    its room; pose: (4, 4), frame of the state's image from that of the CT; samples: (n, 3) mm in the lung in the CT;
+    look: of the lung."""
 
     lung: Lattice
     cavity: Lattice
@@ -36,6 +53,7 @@ class State:
     held: bool
     pose: Array
     samples: Array
+    look: Look = field(default_factory=Look)
 
     def from_ct(self, points: Array) -> Array:
         """Where lung tissue at CT points (n, 3) is in the state's image frame, RAS mm."""
@@ -70,23 +88,27 @@ def image_state(patient: Patient, body: Image, state: State, grid: Grid) -> Pict
     hu = _walls(body, state, grid)
     room = coverage(state.cavity.sample(x), width)
     within = np.flatnonzero(room > 0)
+    look = state.look
+    drowned = np.zeros(len(within), dtype=bool) if look.down is None else x[within] @ look.down > look.level
     del x
     source, ratio, share = _lung_sources(state, grid, within)
     if state.held:
         share = np.ones_like(share)
-    resting = patient.tissue(source)
     lesion = coverage(patient.nodule.distance(source) * np.cbrt(ratio), width) * share
-    if patient.nodule.kind != "given":
-        resting += lesion * (patient.nodule.density(source) - resting)
+    resting = _resting(patient, state, source, lesion)
     tissue = np.minimum((resting + 1000) / ratio - 1000, 40.0)
+    if look.airless is not None:
+        tissue += look.airless.sample(source) * (AIRLESS_HU - tissue)
+    gas = np.where(drowned, FLUID_HU, PLEURAL_AIR_HU)
     # Lung that lies against the wall fills all of the room that a voxel has, not a share of that share.
-    inner = PLEURAL_AIR_HU + np.minimum(share / room[within], 1) * (tissue - PLEURAL_AIR_HU)
+    inner = gas + np.minimum(share / room[within], 1) * (tissue - gas)
     flat = hu.ravel()
     flat[within] += room[within] * (inner - flat[within])
     if patient.trees is not None:
         plain = flat[within].copy()
         draw_lung_trees(hu, carry_trees(patient.trees, state), grid, width)
-        flat[within] += lesion * room[within] * (plain - flat[within])
+        if patient.nodule.shown(state.held):
+            flat[within] += lesion * room[within] * (plain - flat[within])
     lung, nodule = np.zeros(hu.size, dtype=bool), np.zeros(hu.size, dtype=bool)
     lung[within] = (share > 0.5) & (room[within] > 0.5)
     nodule[within] = lesion > 0.5
@@ -94,6 +116,22 @@ def image_state(patient: Patient, body: Image, state: State, grid: Grid) -> Pict
     return Picture(
         Image(hu, affine), Region(lung.reshape(grid.shape), affine), Region(nodule.reshape(grid.shape), affine)
     )
+
+
+def _resting(patient: Patient, state: State, source: Array, lesion: Array) -> Array:
+    """HU (n,) of the lung at points (n, 3) in the CT, as it would be there if it were then as in the state: vessels
+    faded, nodule (share of each point in it) shown or not."""
+    nodule, shown = patient.nodule, patient.nodule.shown(state.held)
+    resting = patient.tissue(source)
+    if patient.trees is None and state.look.vessels < 1:
+        tissue = patient.parenchyma
+        plain = tissue.like(ndimage.gaussian_filter(tissue.values, FADE_MM / tissue.spacing)).sample(source)
+        resting += (1 - state.look.vessels) * (plain - resting)
+    if nodule.kind != "given" and shown:
+        resting += lesion * (nodule.density(source) - resting)
+    if nodule.kind == "given" and not shown:
+        resting += lesion * (PLAIN_HU - resting)
+    return resting
 
 
 def state_points(state: State, grid: Grid) -> Array:
@@ -105,10 +143,12 @@ def state_points(state: State, grid: Grid) -> Array:
 def carry_trees(trees: LungTrees, state: State) -> LungTrees:
     """Trees of the operated lung in the state's image frame; what lies in the mediastinum moves with it."""
     moved = []
-    for tree in (trees.airway, trees.artery, trees.vein):
+    # What keeps an airway open is stiffer than a vessel.
+    widths = (np.sqrt(state.look.vessels), state.look.vessels, state.look.vessels)
+    for tree, width in zip((trees.airway, trees.artery, trees.vein), widths, strict=True):
         outside = smoothstep(state.lung.at(tree.nodes), 0, 12)[:, None]
         inside = state.lung_map(tree.nodes)
-        moved.append(tree.moved(state.posed(inside + outside * (state.motion(tree.nodes) - inside))))
+        moved.append(tree.moved(state.posed(inside + outside * (state.motion(tree.nodes) - inside)), float(width)))
     return LungTrees(*moved)
 
 
@@ -157,5 +197,5 @@ def _piece_sources(piece: SplineMap, samples: Array, x: Array, room: Array) -> A
     bad = (left > 0.01) | (gap > 14)
     found[bad] = plain[bad]
     out[room, :3] = found
-    out[room, 3] = np.clip(piece.determinant(found), 0.2, 3.0)
+    out[room, 3] = np.clip(piece.determinant(found), 0.1, 3.0)
     return out

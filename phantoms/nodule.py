@@ -12,23 +12,30 @@ from phantoms.fields import coverage, smoothstep
 from phantoms.voxels import Grid, Region
 
 Array = NDArray[Any]
-SOLID_HU, GLASS_HU = 25.0, -560.0
+SOLID_HU, GLASS_HU, PLAIN_HU = 25.0, -560.0, -850.0
 
 
 @dataclass(frozen=True)
 class Nodule:
     """A ball of radius (mm) whose surface waves by `relief` mm. centre: (3,) RAS mm in the CT; kind: see `Lesion`, or
-    "given": the lung's tissue holds it already, and images are not painted over."""
+    "given": the lung's tissue holds it already, and images are not painted over; seen: see `Lesion`."""
 
     centre: Array
     radius: float
     relief: float
     kind: str
+    seen: str = "all"
 
     @property
     def stiffening(self) -> float:
-        """Factor on the shear modulus of lung tissue."""
+        """Factor on the shear modulus of lung tissue; one for a nodule that is not to be told by the lung's motion."""
+        if self.seen != "all":
+            return 1.0
         return {"solid": 11.0, "given": 11.0, "part-solid": 6.0, "ground-glass": 2.0}[self.kind]
+
+    def shown(self, inflated: bool) -> bool:
+        """Whether the cone-beam image of the inflated, or else the collapsed, lung shows it."""
+        return self.seen == "all" or (inflated and self.seen == "ct and inflated")
 
     def density(self, points: Array) -> Array:
         """HU in the CT at points (..., 3) of the lesion; a part-solid one has a solid core of half its radius."""

@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from phantoms.cage import CageMotion, fit_dome
-from phantoms.fields import Lattice, coverage, smooth_noise, smoothstep
-from phantoms.imaging import State
+from phantoms.disease import emphysema_of, fibrosis_of
+from phantoms.fields import Lattice, coverage, patches, smooth_noise, smoothstep
+from phantoms.imaging import Look, State
 from phantoms.lobes import surface_points
 from phantoms.patient import Patient
-from phantoms.spec import Collapse, PhantomSpec
+from phantoms.spec import Collapse, Disease, PhantomSpec
 from phantoms.tissue import Equilibrium, Pleura, Scene, Tie, Tissue, relax, tissue_points
 
 Array = NDArray[Any]
@@ -44,14 +45,36 @@ def make_states(
     )
     gravity = np.array([-sign, 0.15, 0.05]) + rng.normal(0, 0.03, 3)
     gravity /= np.linalg.norm(gravity)
-    body = lung_body(patient, collapse, spec.element, rng)
+    airless = airless_of(patient, collapse, gravity)
+    body = lung_body(patient, collapse, spec.element, rng, spec.disease, airless)
     poses = _poses(patient.scanned_centre, rng)
     states, ends = [], []
     for motion, held, pose in ((inflated_motion, True, poses[0]), (deflated_motion, False, poses[1])):
         cavity, end = body.settle(motion, gravity, held, None if held else collapse.deflated)
         ends.append(end)
-        states.append(State(lung, cavity, motion, end.state_from_ct, held, pose, body.tissue.points))
+        look = Look() if held else _look(cavity, collapse, gravity, airless)
+        states.append(State(lung, cavity, motion, end.state_from_ct, held, pose, body.tissue.points, look))
     return (states[0], states[1]), gravity, ends
+
+
+def airless_of(patient: Patient, collapse: Collapse, gravity: Array) -> Lattice | None:
+    """Where the collapsed lung holds no gas, on a lattice in the CT; None where it does everywhere."""
+    if collapse.airless <= 0:
+        return None
+    lung = patient.lung
+    down = (lung.points() @ gravity).reshape(lung.values.shape)
+    inside = lung.values < 0
+    hangs = (down - down[inside].mean()) / down[inside].std()
+    # Thin edges, which nothing holds open, lose their gas before the middle does.
+    edge = np.exp(-np.maximum(-lung.values, 0) / 12)
+    return patches(lung, collapse.airless, 20.0, np.random.default_rng([patient.seed, 21]), 0.7 * hangs + edge)
+
+
+def _look(cavity: Lattice, collapse: Collapse, gravity: Array, airless: Lattice | None) -> Look:
+    if collapse.fluid <= 0:
+        return Look(airless, collapse.vessels)
+    depth = (cavity.points() @ gravity)[cavity.values.ravel() < 0]
+    return Look(airless, collapse.vessels, gravity, float(depth.max() - collapse.fluid))
 
 
 @dataclass(frozen=True)
@@ -83,13 +106,28 @@ class LungBody:
         return cavity, relax(Scene(t, pleura, ties, lobes, gravity), motion, volume_ratio, self.element_mm)
 
 
-def lung_body(patient: Patient, collapse: Collapse, element_mm: float, rng: np.random.Generator) -> LungBody:
-    """The operated lung of a patient, pre-stressed to collapse so far and so unevenly."""
+def lung_body(
+    patient: Patient,
+    collapse: Collapse,
+    element_mm: float,
+    rng: np.random.Generator,
+    disease: Disease | None = None,
+    airless: Lattice | None = None,
+) -> LungBody:
+    """The operated lung of a patient, pre-stressed to collapse so far and so unevenly; airless: see `airless_of`."""
     lobes = patient.lobes
     points, volume, lobe = _by_lobe([tissue_points(region, element_mm / 2) for region in lobes.regions])
     surface = _by_lobe([surface_points(region, 2) for region in lobes.regions])
     tied = np.linalg.norm(points - patient.hilum, axis=1) < (20.0 if len(lobes.regions) == 1 else HINGE_MM)
     shear, slack = _uneven(patient, points, lobe, collapse, rng)
+    if airless is not None:
+        share = airless.sample(points)
+        shear, slack = shear * (1 + 2 * share), slack * (1 - 0.45 * share)
+    if disease is not None:
+        trapped, scarred = (
+            of(patient.lung, disease, patient.seed).sample(points) for of in (emphysema_of, fibrosis_of)
+        )
+        shear, slack = shear * (1 + 4 * scarred) * (1 - 0.4 * trapped), slack * (1 + 0.7 * trapped)
     rest = np.cbrt(np.clip(collapse.deflated * slack, 0.15, 0.95))
     tissue = Tissue(points, volume, shear, rest, 165.0, lobe)
     grown = _grown_to_wall(surface[0], patient, collapse.adhesion)
@@ -138,7 +176,7 @@ def _uneven(
     airless = _airless(points, collapse.atelectasis)
     shear *= 1 + 5 * airless
     slack *= 1 - 0.75 * airless
-    lesion = coverage(patient.nodule.distance(points), 8.0)
+    lesion = coverage(patient.nodule.distance(points), 8.0) * (patient.nodule.seen == "all")
     return shear * (1 + (patient.nodule.stiffening - 1) * lesion), slack + lesion * (1.6 - slack)
 
 

@@ -81,7 +81,7 @@ def draw_thorax(side: str, habitus: str, lesion: Lesion, seed: int, fused: float
     regions[own] = regions[own] if parts is None else parts.regions
     trees = (lung_trees(regions[0], hila[0], 1, rng), lung_trees(regions[1], hila[1], -1, rng))
     centre = place_nodule(shapes.lung(side), build, lesion, 1 - 2 * own, parts, rng)
-    nodule = Nodule(centre, lesion.radius, 0.12 * lesion.radius, lesion.kind)
+    nodule = Nodule(centre, lesion.radius, 0.12 * lesion.radius, lesion.kind, lesion.seen)
     line = Sheet(hila[own], 8.0, rng.uniform(0.7, 1.1), rng.uniform(-8, 8))
     lobes = parts or whole(lung, Fissures(line, None, np.inf))
     return Thorax(shapes, spine, _parenchyma(shapes, rng), hila, trees, nodule, lobes, side, seed)

@@ -131,11 +131,11 @@ def _patient(scan: Scan, build: Build, spec: PhantomSpec, seed: int, rng: np.ran
         around = rng.uniform(-lesion.radius, lesion.radius, (200, 3))
         # Lung that is plain in the scan: no vessel wide enough to be told from the nodule.
         centre = min(places, key=lambda p: float(np.percentile(tissue.sample(p + around), 95)))
-        nodule = Nodule(centre, lesion.radius, 0.12 * lesion.radius, lesion.kind)
+        nodule = Nodule(centre, lesion.radius, 0.12 * lesion.radius, lesion.kind, lesion.seen)
     else:
         inside = scan.nodule.grid.to_ras(np.argwhere(scan.nodule.inside))
         volume = len(inside) * float(scan.nodule.grid.spacing.prod())
-        nodule = Nodule(inside.mean(axis=0), float(np.cbrt(volume * 0.75 / np.pi)), 0.0, "given")
+        nodule = Nodule(inside.mean(axis=0), float(np.cbrt(volume * 0.75 / np.pi)), 0.0, "given", spec.lesion.seen)
     lobes = whole(lung, Fissures(Sheet(scan.hilum, 8.0, 0.9, 0.0), None, np.inf, drawn=False))
     return Patient(spec.side, seed, build, lung, lobes, scan.hilum, nodule, tissue, None)
 

@@ -47,7 +47,7 @@ phantom = typer.Typer(
 
 SeedOption = Annotated[int, typer.Option("--seed", metavar="N", help="Seed of the anatomy.")]
 CbctOption = Annotated[
-    str, typer.Option(metavar="DOMAIN", help='Scanner: image, or projection for a C-arm (extra "projections").')
+    str | None, typer.Option(metavar="DOMAIN", help="Scanner: image, or projection for a C-arm; else the recipe's.")
 ]
 CaseOption = Annotated[Path, typer.Option("--out", metavar="CASE", help="Case folder to write.")]
 CtOption = Annotated[Path, typer.Option("--from-ct", metavar="FILE", help="Chest CT to make a twin of.")]
@@ -59,7 +59,7 @@ def make_case(
     name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the phantom, for instance demo.")],
     out: CaseOption,
     seed: SeedOption = 0,
-    cbct: CbctOption = "image",
+    cbct: CbctOption = None,
 ) -> None:
     """Write one phantom, collapsed, with its truth."""
     from vatsloc.synthetic import write_phantom
@@ -78,7 +78,7 @@ def make_suite(
     beside: Annotated[
         Path | None, typer.Option(metavar="CASE", help="Case made from a real scan that the sheet shows first.")
     ] = None,
-    cbct: CbctOption = "image",
+    cbct: CbctOption = None,
 ) -> None:
     """Write every case of the suite and a table of how hard they are."""
     from vatsloc.study.cohort.contact_sheet import write_sheet
@@ -102,7 +102,7 @@ def make_twin(
     nodule: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Mask of the nodule in the CT; else one is put in.")
     ] = None,
-    cbct: CbctOption = "image",
+    cbct: CbctOption = None,
 ) -> None:
     """Write the twin of a scan, collapsed."""
     from vatsloc.synthetic.case import side_named, write_twin

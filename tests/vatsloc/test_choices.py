@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from phantoms.cbct import Scanner
-from phantoms.spec import SPECS, Collapse, Lesion, PhantomSpec
+from phantoms.recipes import SPECS
+from phantoms.spec import Collapse, Lesion, PhantomSpec
 from registration.correspondences import Correspondences
 from registration.sliding import moved_mm
 from tests.vatsloc.ball_scene import sliding_fit

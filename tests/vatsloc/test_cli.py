@@ -10,7 +10,7 @@ import nibabel as nib
 import numpy as np
 import pytest
 
-from phantoms.spec import SPECS
+from phantoms.recipes import SPECS
 from registration.volume import Volume
 from tests import made_once
 from vatsloc.cli import main

@@ -95,6 +95,9 @@ def test_every_case_gets_its_line_although_one_crashes(
         "| good | 0 | 1.00 / 2.00 / 3.00 | 1.00 / 2.00 / 3.00 | 1.00 / 2.00 / 3.00 | 3.00 / 6.00 | 2.00 / 5.00 | 0.50 "
     )
     assert "holds the nodule in 1 of 3 cases (1 of 2 under exit code 0)" in lines[-1]
+    assert (
+        "mean of the cases / median of their 95 %, mm: 3.0 / 6.0 at 0 to 5 mm, 2.0 / 5.0 at 5 to 10 mm. " in lines[-1]
+    )
     assert "tissue in view by depth below the pleura: 90.0 % at 0 to 5 mm, 100.0 % at 5 to 10 mm. False" in lines[-1]
     assert "(a gate failed, yet nodule and tissue are right to 3 mm on average): 1 of 2." in lines[-1]
     assert [outcomes[name].false_alarm for name in ("good", "gated", "wrong")] == [False, True, None]
@@ -134,11 +137,26 @@ def test_coverage_and_silent_failures_are_shares_of_what_can_be_told() -> None:
     ]
     assert as_json(outcomes)["coverage95"] == 0.5
     assert as_json(outcomes)["silent_failure_share"] == 0.5
-    assert summary(outcomes).startswith("3 cases, 2 with exit code 0.")
+    assert summary(outcomes).startswith("3 cases, 2 with exit code 0, 1 with 3.")
     assert "radius holds 50 of 60 landmarks" in summary(outcomes)
     assert [case["landmarks_in_radius95"] for case in as_json(outcomes)["cases"]] == [0.75, 1.0, None]
     assert "| a / b |" in table(outcomes)
     assert "| 30 of 40 |" in table(outcomes)
+
+
+def test_nodules_are_told_by_the_images_that_show_them() -> None:
+    errors = {"mean": 1.0, "p95": 2.0, "max": 3.0}
+
+    def of(seen: str | None, nodule_mm: float, held: bool) -> Outcome:
+        scores = {"phase1": errors, "phase2": errors, "chain": errors, "nodule_in_ellipsoid95": held}
+        scores["nodule_deflated_mm"] = nodule_mm
+        return Outcome("a", 0, 1.0, 1.0, "", [], 0, scores, [], seen)
+
+    told = summary([of("ct", 2.0, True), of("ct", 6.0, False), of("all", 0.5, True), of(None, 9.0, False)])
+    assert "0.5 / 0.5, 1 of 1 in their ellipsoid, where all images show them; " in told
+    assert "; 4.0 / 5.8, 1 of 2 in their ellipsoid, where neither cone-beam image does. " in told
+    assert "where the deflated image does not" not in told
+    assert as_json([of("ct", 2.0, True)])["cases"][0]["nodule_seen"] == "ct"
 
 
 def _held(share: float, n: int) -> dict[str, Any]:

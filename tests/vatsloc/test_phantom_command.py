@@ -15,11 +15,11 @@ from vatsloc.study.cohort import contact_sheet, suite
 from vatsloc.synthetic import case, series
 from vatsloc.terminal import say
 
-CASE = ("write_phantom", "demo", Path("c"), 0, say, "image")
-SUITE = ("write_suite", Path("d"), 1, say, "image")
+CASE = ("write_phantom", "demo", Path("c"), 0, say, None)
+SUITE = ("write_suite", Path("d"), 1, say, None)
 
 
-def twin(side: str = "right", name: str | None = None, nodule: Path | None = None, cbct: str = "image") -> Any:
+def twin(side: str = "right", name: str | None = None, nodule: Path | None = None, cbct: str | None = None) -> Any:
     return ("write_twin", Path("f"), side, Path("c"), name, 0, nodule, say, cbct)
 
 

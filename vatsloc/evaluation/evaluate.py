@@ -168,16 +168,28 @@ def _dense(points: Array, truth: Truth, result: Result) -> tuple[dict[str, Any],
 
 def _dense_by_depth(errors: dict[str, Array], depth_mm: Array, radius_mm: Array) -> list[dict[str, Any]]:
     """Classes of depth below the pleura: n, mean, 95 % and maximum of each error (n,) mm, share within the radius."""
+    classes = errors_by_depth(errors, depth_mm)
+    for told, at in zip(classes, _classes(depth_mm), strict=True):
+        told["share_in_radius95"] = _held(errors["chain"][at], radius_mm[at])["share"]
+    return classes
+
+
+def errors_by_depth(errors: dict[str, Array], depth_mm: Array) -> list[dict[str, Any]]:
+    """Classes of depth (n,) mm below the pleura: n, and mean, 95 % and maximum of each error (n,) mm by its name, None
+    where n is 0."""
     classes = []
-    for low, high in pairwise(DENSE_DEPTHS_MM):
-        at = (depth_mm < high) & (depth_mm >= (low if low > 0 else -np.inf))
+    for (low, high), at in zip(pairwise(DENSE_DEPTHS_MM), _classes(depth_mm), strict=True):
         told: dict[str, Any] = {"from_mm": low, "to_mm": None if math.isinf(high) else high, "n": int(at.sum())}
         for measure, mm in errors.items():
             s = summarize(mm[at])
             told[measure] = {"mean": s.mean, "p95": s.p95, "max": s.max} if s.n else None
-        told["share_in_radius95"] = _held(errors["chain"][at], radius_mm[at])["share"]
         classes.append(told)
     return classes
+
+
+def _classes(depth_mm: Array) -> list[Array]:
+    """Which points (n,) bool are of each class of depth."""
+    return [(depth_mm < high) & (depth_mm >= (low if low > 0 else -np.inf)) for low, high in pairwise(DENSE_DEPTHS_MM)]
 
 
 def _radius95(result: Result, points_ct: Array) -> Array:

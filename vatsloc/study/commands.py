@@ -117,7 +117,7 @@ def bench_cbct_command(
     seed: Annotated[int, typer.Option(metavar="N", help="Seed of the anatomy.")] = 0,
     as_json: JsonOption = False,
 ) -> None:
-    """The phantoms' cone-beam scanner in the image domain beside a C-arm's projections (extra "projections")."""
+    """The phantoms' cone-beam scanner in the image domain beside a C-arm's projections."""
     from vatsloc.study.bench.cbct import bench_cbct, table
 
     result = bench_cbct(name, seed, say)
@@ -239,10 +239,13 @@ def calibrate_forecast(
 
 
 def cohort(
-    folders: Annotated[
-        list[Path], typer.Argument(metavar="DIR...", help="Case folders, or folders that hold case folders.")
-    ],
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for results and tables; a rerun goes on.")],
+    folders: Annotated[
+        list[Path] | None, typer.Argument(metavar="DIR...", help="Case folders, or folders that hold case folders.")
+    ] = None,
+    suite: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Run the suite of phantoms, made in DIR where they lack.")
+    ] = None,
     preset: PresetOption = "balanced",
     settings: SettingsOption = None,
     jobs: Annotated[int, typer.Option(metavar="N", min=1, help="Cases run at once.")] = 1,
@@ -254,10 +257,12 @@ def cohort(
     """Localize and score many cases; one table of errors, gates, seconds and memory as CSV, Markdown and HTML."""
     from vatsloc.study.cohort.cohort import as_json as cohort_json
     from vatsloc.study.cohort.cohort import find_cases, run_cohort, table
+    from vatsloc.study.cohort.suite import write_suite
     from vatsloc.workflow.settings import load_settings
 
     load_settings(preset, settings)
-    outcomes = run_cohort(find_cases(folders), out, preset, settings, jobs, scheduler, say=say)
+    made = [] if suite is None else [suite / name for name in write_suite(suite, jobs, say)]
+    outcomes = run_cohort(find_cases([*(folders or []), *made]), out, preset, settings, jobs, scheduler, say=say)
     if as_json:
         show(cohort_json(outcomes))
     else:

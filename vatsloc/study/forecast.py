@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from phantoms.spec import SPECS, SUITE, Collapse, PhantomSpec
+from phantoms.recipes import SPECS, SUITE
+from phantoms.spec import Collapse, PhantomSpec
 from phantoms.states import make_states
 from phantoms.thorax import draw_thorax
 from registration.volume import Array

@@ -5,15 +5,14 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import asdict, replace
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from phantoms.case import PhantomCase, make_case
-from phantoms.projection import MISSING
-from phantoms.spec import SPECS, PhantomSpec
+from phantoms.recipes import SPECS
+from phantoms.spec import PhantomSpec
 from phantoms.twin import Scan, make_twin
 from registration.volume import Array
 from vatsloc.errors import CaseError, InputRefused
@@ -32,11 +31,11 @@ INFO_FILE = "truth/info.json"
 DENSE_HEADER = "ct_x,ct_y,ct_z,inf_x,inf_y,inf_z,def_x,def_y,def_z"
 
 
-def write_phantom(name: str, folder: Path, seed: int = 0, say: Say = quiet, cbct: str = "image") -> None:
+def write_phantom(name: str, folder: Path, seed: int = 0, say: Say = quiet, cbct: str | None = None) -> None:
     """Make the phantom called `name` and write it as a case folder, whole or not at all.
 
-    cbct: domain of the scanner, "image" or "projection". Raises CaseError for an unknown name or domain, where RTK is
-    missing that a domain needs, or where `folder` holds something else.
+    cbct: domain of the scanner, "image" or "projection", default that of the recipe. Raises CaseError for an unknown
+    name or domain, or where `folder` holds something else.
     """
     if name not in SPECS:
         raise CaseError(f'"{name}" is no phantom; choose one of {", ".join(SPECS)}.')
@@ -45,12 +44,12 @@ def write_phantom(name: str, folder: Path, seed: int = 0, say: Say = quiet, cbct
     _write_whole(lambda: make_case(spec, seed), folder, recipe(name, seed, cbct), say)
 
 
-def scanned(spec: PhantomSpec, cbct: str) -> PhantomSpec:
-    """The phantom with its scanner in a domain; raises CaseError for an unknown one, or where RTK is missing for it."""
+def scanned(spec: PhantomSpec, cbct: str | None) -> PhantomSpec:
+    """The phantom with its scanner in a domain, None for that of its recipe; raises CaseError for an unknown one."""
+    if cbct is None:
+        return spec
     if cbct not in ("image", "projection"):
         raise CaseError(f'--cbct must be image or projection, got "{cbct}".')
-    if cbct == "projection" and find_spec("itk") is None:
-        raise CaseError(f"{MISSING}.")
     return replace(spec, scanner=replace(spec.scanner, domain=cbct))
 
 
@@ -62,7 +61,7 @@ def write_twin(
     seed: int = 0,
     nodule: Path | None = None,
     say: Say = quiet,
-    cbct: str = "image",
+    cbct: str | None = None,
 ) -> None:
     """Make the digital twin of one scan and write it as a case folder, whole or not at all.
 
@@ -119,7 +118,7 @@ def _write_whole(make: Callable[[], PhantomCase], folder: Path, made_from: dict[
     say(f"{made.spec.name} written to {folder}: {cost['seconds']:.0f} s, {cost['peak_mb']:.0f} MB")
 
 
-def recipe(name: str, seed: int, cbct: str = "image") -> dict[str, Any]:
+def recipe(name: str, seed: int, cbct: str | None = None) -> dict[str, Any]:
     """What a phantom is made from, as its truth/info.json says it."""
     return {"spec": json.loads(json.dumps(asdict(scanned(SPECS[name], cbct)))), "seed": seed}
 

@@ -10,9 +10,9 @@ import numpy as np
 from phantoms.case import make_case
 from phantoms.cbct import expose
 from phantoms.imaging import image_state
-from phantoms.projection import attenuation, c_arm_of, develop, project, scene_grid
+from phantoms.projection import c_arm_of, develop, project, scene_grid
+from phantoms.recipes import SPECS
 from phantoms.scanner_figures import scanner_figures
-from phantoms.spec import SPECS
 from phantoms.thorax import ct_grid, draw_thorax, image_body
 from phantoms.voxels import Image
 from vatsloc.errors import CaseError
@@ -23,7 +23,7 @@ from vatsloc.workflow.stages import Say, quiet
 def bench_cbct(name: str = "demo", seed: int = 0, say: Say = quiet) -> dict[str, Any]:
     """Figures of `scanner_figures` and seconds by domain for the collapsed lung of a phantom.
 
-    Raises CaseError for an unknown name, or where RTK is missing.
+    Raises CaseError for an unknown name.
     """
     if name not in SPECS:
         raise CaseError(f'"{name}" is no phantom; choose one of {", ".join(SPECS)}.')
@@ -43,7 +43,7 @@ def bench_cbct(name: str = "demo", seed: int = 0, say: Say = quiet) -> dict[str,
     say("projection domain ...")
     scene = image_state(case.patient, body, case.deflated, scene_grid(view)).clean
     arm = c_arm_of(scanner, float(view.spacing.mean()))
-    exact = project(attenuation(scene), scene.grid.spacing, arm)
+    exact = project(scene, arm)
     projected = time.perf_counter()
     seen = [develop(exact, view, scanner, np.random.default_rng(n), arm) for n in (1, 2)]
     end = time.perf_counter()

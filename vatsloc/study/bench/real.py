@@ -14,9 +14,11 @@ from poro.breathing.affine import affine_to_points, affine_to_shape
 from poro.breathing.elastic import WALL_ALONE, Breathing, Lung, breathe_out
 from poro.mesh import TetMesh, interpolate, locate
 from vatsloc.evaluation.statistics import distances, summarize
+from vatsloc.frames import Side
 from vatsloc.study.bench.breaths import Marks, read_person
+from vatsloc.study.bench.real_images import has_images, registered
+from vatsloc.study.bench.real_images import table as images_table
 
-EDGE_MM = 12.0
 UNMOVED, CENTROID, SHAPE_AFFINE = "unmoved", "centroid of the shape", "affine map fitted to the shape"
 ELASTIC = "elastic lung that slides on its wall"
 BREATHING = "the same with weight, bronchi and ribs"
@@ -56,11 +58,15 @@ def bench_real(folders: Sequence[Path], say: Callable[[str], None] = lambda _: N
 
 
 def measure(folder: Path, say: Callable[[str], None]) -> dict[str, Any]:
-    """All rows of one person, both ways. seconds: reading, meshing and the row `BREATHING`."""
+    """All rows of one person, both ways, and figures of registration (`images`, by side) where there are images.
+    seconds: reading, meshing and the row `BREATHING`."""
     began = perf_counter()
+    say(f"{folder.name}: reading and meshing ...")
     person = read_person(folder)
-    say(f"{person.name}: reading and meshing ...")
-    lungs = person.lungs(EDGE_MM)
+    for note in person.notes:
+        say(f"{person.name}: {note}")
+    lungs = person.lungs
+    nodes: dict[Side, dict[str, Array]] = {lung.side: {} for lung in lungs}
     marks = [person.marks(lung.side) for lung in lungs]
     out: dict[str, Any] = {}
     back: dict[str, Any] = {}
@@ -71,6 +77,8 @@ def measure(folder: Path, say: Callable[[str], None]) -> dict[str, Any]:
         moved = [predict(lung) for lung in lungs]
         if name == BREATHING:
             seconds += perf_counter() - began
+        for lung, there in zip(lungs, moved, strict=True):
+            nodes[lung.side][name] = there
         ways = [errors(lung, there, known) for lung, there, known in zip(lungs, moved, marks, strict=True)]
         out[name] = _row({lung.side: way[0] for lung, way in zip(lungs, ways, strict=True)})
         back[name] = _row({lung.side: way[1] for lung, way in zip(lungs, ways, strict=True)})
@@ -81,6 +89,10 @@ def measure(folder: Path, say: Callable[[str], None]) -> dict[str, Any]:
         **_way("inspiration to expiration", out),
         "seconds": seconds,
         "back": _way("expiration to inspiration", back),
+        "images": {p.side: registered(person.case, p, nodes[p.side], say) for p in person.pairs}
+        if has_images(person.case)
+        else None,
+        "notes": list(person.notes),
     }
 
 
@@ -103,6 +115,8 @@ def table(result: dict[str, Any]) -> str:
             for name, row in way["rows"].items():
                 cells = (f"{s['mean']:.2f} / {s['p95']:.1f} / {s['max']:.1f}" for s in row.values())
                 lines.append(f"  {name:40s}" + "".join(f"{cell:>22s}" for cell in cells))
+        for side, found in (case["images"] or {}).items():
+            lines += images_table(case["name"], side, found)
     return "\n".join(lines)
 
 

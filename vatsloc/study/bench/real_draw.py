@@ -8,7 +8,7 @@ from pathlib import Path
 from poro.breathing.elastic import caudal
 from poro.mesh import interpolate, locate
 from vatsloc.study.bench.breaths import read_person
-from vatsloc.study.bench.real import BREATHING, EDGE_MM, ELASTIC, ROWS
+from vatsloc.study.bench.real import BREATHING, ELASTIC, ROWS
 from vatsloc.study.chart.draw import require_matplotlib
 
 VIEWS = ((1, 2, "from the side, front to the right"), (0, 2, "from the front"))
@@ -27,9 +27,12 @@ def draw_real(folders: Sequence[Path], file: Path) -> None:
     from matplotlib import pyplot
 
     people = [read_person(folder) for folder in folders]
-    figure, axes = pyplot.subplots(2 * len(people), 4, figsize=(17, 9 * len(people)), squeeze=False)
-    for number, person in enumerate(people):
-        for row, lung in zip(axes[2 * number : 2 * number + 2], person.lungs(EDGE_MM), strict=True):
+    count = sum(len(person.lungs) for person in people)
+    figure, axes = pyplot.subplots(count, 4, figsize=(17, 4.5 * count), squeeze=False)
+    rows = iter(axes)
+    for person in people:
+        for lung in person.lungs:
+            row = next(rows)
             marks = person.marks(lung.side)
             where = locate(lung.inspired, marks.inspired)
             shell = lung.expired.boundary.points

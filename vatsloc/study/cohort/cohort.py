@@ -7,6 +7,7 @@ import io
 import math
 import os
 import time
+from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import Future, as_completed
 from itertools import pairwise
@@ -14,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import jinja2
+import numpy as np
 
 from vatsloc.errors import CaseError
 from vatsloc.evaluation.evaluate import DENSE_DEPTHS_MM
@@ -35,6 +37,8 @@ _STATISTICS = ("mean", "p95", "max")
 def find_cases(folders: Sequence[Path]) -> list[Path]:
     """Case folders among `folders` and right inside them, each once. Raises CaseError for a folder without any, and
     where two cases share a name."""
+    if not folders:
+        raise CaseError("no case is given; give case folders, folders of them, or --suite DIR.")
     found: list[Path] = []
     for folder in folders:
         inside = [folder] if (folder / FILE_NAME).is_file() else sorted(p.parent for p in folder.glob(f"*/{FILE_NAME}"))
@@ -136,10 +140,11 @@ def summary(outcomes: Sequence[Outcome]) -> str:
     silent = [o.silent_failure for o in outcomes if o.silent_failure is not None]
     alarms = [o.false_alarm for o in outcomes if o.false_alarm is not None]
     return (
-        f"{len(outcomes)} cases, {sum(o.exit_code == 0 for o in outcomes)} with exit code 0. "
+        f"{len(outcomes)} cases, {_exit_codes(outcomes)}. "
         f"The 95 % ellipsoid holds the nodule in {_of(held)} cases ({_of(trusted)} under exit code 0). "
+        f"{_nodules(outcomes)}"
         f"Their own 95 % radius holds {_sum(outcomes)} landmarks. "
-        f"{_tissue_in_radius(outcomes)}"
+        f"{_tissue_errors(outcomes)}{_tissue_in_radius(outcomes)}"
         f"False alarms (a gate failed, yet nodule and tissue are right to {RIGHT_MM:g} mm on average): {_of(alarms)}. "
         f"Silent failures (nodule or mean landmark error over {SILENT_MM:g} mm under exit code 0): {_of(silent)}."
     )
@@ -159,12 +164,19 @@ def as_json(outcomes: Sequence[Outcome]) -> dict[str, Any]:
 DEPTHS_MM = tuple(pairwise(DENSE_DEPTHS_MM))
 SHALLOW_MM = DEPTHS_MM[:2]
 """Classes of depth that have columns of their own: where nodules lie that nobody can feel."""
+_SEEN = {
+    "all": "all images show them",
+    "ct and inflated": "the deflated image does not",
+    "ct": "neither cone-beam image does",
+}
+"""Where a phantom's nodule is to be seen, in words."""
 _HEADS = (
     "case",
     "exit",
     *_PHASES.values(),
     *(f"tissue {from_mm:g}-{to_mm:g} mm" for from_mm, to_mm in SHALLOW_MM),
     "nodule",
+    "seen in",
     "ellipsoid holds it",
     "landmarks in their 95 % radius",
     "failed gates",
@@ -187,6 +199,7 @@ def _record(o: Outcome) -> dict[str, Any]:
         },
         "tissue_in_view_mm": o.tissue_mm,
         "nodule_mm": o.nodule_mm,
+        "nodule_seen": o.nodule_seen,
         "nodule_in_ellipsoid95": o.nodule_in_ellipsoid,
         "landmarks_in_radius95": _share(o.landmarks_in_radius),
         "silent_failure": o.silent_failure,
@@ -206,7 +219,7 @@ def _cells(o: Outcome) -> list[str]:
     tail = [radius, ", ".join(o.failed_gates), f"{o.seconds:.0f}", f"{o.peak_mb:.0f}", says]
     classes = [o.tissue(from_mm) for from_mm, _ in SHALLOW_MM]
     tissue = [" / ".join(_number(d["chain"][s]) for s in ("mean", "p95")) if d else "" for d in classes]
-    return [o.name, str(o.exit_code), *phases, *tissue, _number(o.nodule_mm), held, *tail]
+    return [o.name, str(o.exit_code), *phases, *tissue, _number(o.nodule_mm), o.nodule_seen or "", held, *tail]
 
 
 def _number(value: float | None) -> str:
@@ -233,12 +246,48 @@ def _tissue_in_radius(outcomes: Sequence[Outcome]) -> str:
         known = [d for d in (o.tissue(from_mm) for o in outcomes) if d and d["share_in_radius95"] is not None]
         if known:
             share = sum(d["share_in_radius95"] * d["n"] for d in known) / sum(d["n"] for d in known)
-            parts.append(
-                f"{100 * share:.1f} % at {from_mm:g} {f'to {to_mm:g} mm' if to_mm < math.inf else 'mm and deeper'}"
-            )
+            parts.append(f"{100 * share:.1f} % at {_depth(from_mm, to_mm)}")
     return (
         f"Their own 95 % radius holds tissue in view by depth below the pleura: {', '.join(parts)}. " if parts else ""
     )
+
+
+def _tissue_errors(outcomes: Sequence[Outcome]) -> str:
+    """Sentence about the chain's error at tissue, class of depth by class: mean of the cases, and their median of the
+    95 %; empty without dense truth."""
+    parts = []
+    for from_mm, to_mm in DEPTHS_MM:
+        known = [d["chain"] for d in (o.tissue(from_mm) for o in outcomes) if d]
+        if known:
+            mean, p95 = np.mean([d["mean"] for d in known]), np.median([d["p95"] for d in known])
+            parts.append(f"{mean:.1f} / {p95:.1f} at {_depth(from_mm, to_mm)}")
+    return (
+        f"Tissue in view by depth, mean of the cases / median of their 95 %, mm: {', '.join(parts)}. " if parts else ""
+    )
+
+
+def _nodules(outcomes: Sequence[Outcome]) -> str:
+    """Sentence about the nodules by the images that show them; empty where that is not known."""
+    parts = []
+    for seen, words in _SEEN.items():
+        known = [o for o in outcomes if o.nodule_seen == seen and o.nodule_mm is not None]
+        if known:
+            mm = [o.nodule_mm for o in known if o.nodule_mm is not None]
+            held = [bool(o.nodule_in_ellipsoid) for o in known]
+            parts.append(
+                f"{np.mean(mm):.1f} / {np.percentile(mm, 95):.1f}, {_of(held)} in their ellipsoid, where {words}"
+            )
+    return f"Nodules, mean / 95 % mm: {'; '.join(parts)}. " if parts else ""
+
+
+def _exit_codes(outcomes: Sequence[Outcome]) -> str:
+    counts = Counter(o.exit_code for o in outcomes)
+    more = ", ".join(f"{counts[code]} with {code}" for code in sorted(counts) if code != 0)
+    return f"{counts[0]} with exit code 0" + (f", {more}" if more else "")
+
+
+def _depth(from_mm: float, to_mm: float) -> str:
+    return f"{from_mm:g} {f'to {to_mm:g} mm' if to_mm < math.inf else 'mm and deeper'}"
 
 
 def _in_order(jobs: Sequence[Job], done: dict[str, Outcome]) -> list[Outcome]:

@@ -14,6 +14,7 @@ from typing import Any
 
 from vatsloc.formats.casefile import FILE_NAME
 from vatsloc.formats.folder import RUN_FILE, write_whole
+from vatsloc.synthetic.case import read_info
 
 OUTCOME_FILE = "outcome.json"
 SILENT_MM = 10.0
@@ -48,7 +49,8 @@ class Outcome:
     """How one case ended. exit_code: of localize, negative where a signal ended it; seconds: wall time of localize;
     peak_mb: as run.json says, else that of its process, no less than this one's; says: the last line of localize or
     evaluate, whichever failed; evaluate_code: exit code of evaluate, None where it had nothing to score; scores:
-    tre.json, or None; asked: case, its date, preset, settings."""
+    tre.json, or None; asked: case, its date, preset, settings; nodule_seen: the images that show a phantom's nodule, as
+    its recipe says, None where it does not say."""
 
     name: str
     exit_code: int
@@ -59,6 +61,7 @@ class Outcome:
     evaluate_code: int | None
     scores: dict[str, Any] | None
     asked: list[str]
+    nodule_seen: str | None = None
 
     @property
     def complete(self) -> bool:
@@ -125,7 +128,8 @@ def run_one(job: Job) -> Outcome:
         if code >= 0 or n == TRIES:
             break
         (job.folder / "localize.log").replace(job.folder / f"localize-{n}.log")
-    outcome = Outcome(job.folder.name, code, seconds, peak, says if code else "", [], None, None, asked_of(job))
+    says = says if code else ""
+    outcome = Outcome(job.folder.name, code, seconds, peak, says, [], None, None, asked_of(job), nodule_seen(job.case))
     if code in (0, 5):
         run = json.loads((result / RUN_FILE).read_text(encoding="utf-8"))
         gates = [name for name, gate in run["gates"].items() if not gate["ok"]]
@@ -136,6 +140,12 @@ def run_one(job: Job) -> Outcome:
         outcome = replace(outcome, peak_mb=run["peak_mb"])
     write_whole(job.folder / OUTCOME_FILE, json.dumps(asdict(outcome), indent=1) + "\n")
     return outcome
+
+
+def nodule_seen(case: Path) -> str | None:
+    """The images that show the nodule of a phantom, as its recipe says; None where it does not say."""
+    seen = ((read_info(case) or {}).get("spec") or {}).get("lesion", {}).get("seen")
+    return None if seen is None else str(seen)
 
 
 def program_of(job: Job) -> tuple[str, ...]:

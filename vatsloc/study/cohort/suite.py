@@ -7,7 +7,7 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-from phantoms.spec import SUITE
+from phantoms.recipes import SUITE
 from vatsloc.synthetic.case import read_info, recipe, write_phantom
 from vatsloc.workflow.stages import Say, quiet
 
@@ -28,9 +28,9 @@ _COLUMNS = {
 }
 
 
-def write_suite(folder: Path, jobs: int = 1, say: Say = quiet, cbct: str = "image") -> dict[str, dict[str, Any]]:
+def write_suite(folder: Path, jobs: int = 1, say: Say = quiet, cbct: str | None = None) -> dict[str, dict[str, Any]]:
     """Make the cases of `SUITE` that `folder` lacks, `jobs` at once, each in a process of its own; truth/info.json of
-    all of them by name. cbct: domain of the scanners."""
+    all of them by name. cbct: domain of the scanners, default those of the recipes."""
     missing = [name for name, seed in SUITE.items() if not _made(folder / name, recipe(name, seed, cbct))]
     say(f"{len(SUITE) - len(missing)} of {len(SUITE)} cases are there, {len(missing)} to make")
     with ProcessPoolExecutor(jobs, get_context("spawn"), max_tasks_per_child=1) as pool:
