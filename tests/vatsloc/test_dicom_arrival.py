@@ -29,17 +29,6 @@ from vatsloc.errors import CaseError
 pytestmark = needs_dcmtk
 
 
-@pytest.fixture(scope="module")
-def scans(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, Path]]:
-    folder = tmp_path_factory.mktemp("scans")
-    return {patient: scene.write_patient(folder, patient) for patient in ("A-1", "B-2")}
-
-
-@pytest.fixture
-def nodules(tmp_path: Path) -> NoduleFiles:
-    return scene.nodule_files(tmp_path / "nodules", "A-1", "B-2")
-
-
 def test_titles_that_are_not_allowed_are_refused(
     tmp_path: Path, scans: dict[str, dict[str, Path]], nodules: NoduleFiles
 ) -> None:

@@ -24,17 +24,6 @@ from vatsloc.errors import CaseError, InputRefused
 pytestmark = needs_dcmtk
 
 
-@pytest.fixture(scope="module")
-def scans(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, Path]]:
-    folder = tmp_path_factory.mktemp("scans")
-    return {patient: scene.write_patient(folder, patient) for patient in ("A-1", "B-2")}
-
-
-@pytest.fixture
-def nodules(tmp_path: Path) -> NoduleFiles:
-    return scene.nodule_files(tmp_path / "nodules", "A-1", "B-2")
-
-
 def test_three_series_pushed_come_back_as_segmentation_and_report(
     tmp_path: Path, scans: dict[str, dict[str, Path]], nodules: NoduleFiles
 ) -> None:
