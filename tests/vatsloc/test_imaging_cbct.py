@@ -116,6 +116,19 @@ def test_image_without_bone_has_no_spine() -> None:
         segment_spine(Volume(hu, scene.volume.ras_from_ijk))
 
 
+def test_a_steel_port_is_not_taken_for_the_spine() -> None:
+    """A trocar between the ribs, and what its streaks brighten about it."""
+    scene = known.thorax()
+    x = scene.volume.grid.points()
+    off = np.linalg.norm(x[..., :2] - [90.0, -40.0], axis=-1)
+    hu = np.where(off < 14.0, np.float32(600), scene.volume.hu)
+    hu = np.where(off < 4.0, np.float32(3000), hu)
+    done = prepare_cbct(known.cone_beam(Volume(hu, scene.volume.ras_from_ijk), (25.0, 10.0), 105.0))
+    spine = segment_spine(done.volume, done.field.usable)
+    assert_allclose(spine.centres_ras[:, 0], 0.0, atol=6.0)
+    assert not spine.mask.inside[off < 4.0].any()
+
+
 def test_a_bright_sternum_is_not_taken_for_the_spine() -> None:
     scene = known.thorax()
     x = scene.volume.grid.points()

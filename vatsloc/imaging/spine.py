@@ -19,6 +19,8 @@ REACH_R_MM = 40.0
 REACH_FRONT_MM = 36.0
 REACH_BACK_MM = 48.0
 LEAST_LENGTH_MM = 60.0
+METAL_HU, METAL_RIM_MM = 2000.0, 15.0
+"""No bone is so dense; streaks make metal's surroundings look like bone."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +57,8 @@ def segment_spine(image: Volume, usable: Mask | None = None) -> Spine:
         else on_grid(usable.inside, usable.grid, work.grid).inside
     )
     bone_hu = bone_threshold(work.hu[seen])
-    excess = np.where(seen, np.clip(work.hu - bone_hu, 0, 250), 0).astype(np.float32)
+    metal = dilate(work.hu > METAL_HU, METAL_RIM_MM, spacing)
+    excess = np.where(seen & ~metal, np.clip(work.hu - bone_hu, 0, 250), 0).astype(np.float32)
     slices = np.flatnonzero(seen.any(axis=(0, 1)))
     if slices.size * spacing[2] < LEAST_LENGTH_MM:
         raise InputRefused(
