@@ -5,6 +5,6 @@ of a `Scene`: tissue, pressure, point constraints and a cavity.
 """
 
 from poro.breathing.elastic import Breathing, Lung, breathe_out
-from poro.breathing.equilibrium import PointConstraints, Scene, balance
+from poro.breathing.equilibrium import ConstraintTerms, Scene, balance
 
-__all__ = ["Breathing", "Lung", "PointConstraints", "Scene", "balance", "breathe_out"]
+__all__ = ["Breathing", "ConstraintTerms", "Lung", "Scene", "balance", "breathe_out"]

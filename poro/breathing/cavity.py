@@ -13,7 +13,7 @@ from scipy.sparse import csr_matrix, diags
 
 from poro.arrays import Array
 from poro.breathing.elastic import WALL_KPA_PER_MM, Breathing, Lung, caudal, hilum, spread_map
-from poro.breathing.equilibrium import Cavity, PointConstraints, Scene, tree_of
+from poro.breathing.equilibrium import Cavity, ConstraintTerms, Scene, tree_of
 from poro.contact.levelset import level_set
 from poro.fem.constitutive import ConstitutiveModel, neo_hookean
 from poro.fem.tissue import GRAVITY_KPA_PER_MM, Tissue
@@ -51,7 +51,7 @@ class Inflating:
         wall = self.cavity
         cavity = Cavity(wall.level, wall.nodes, wall.stiffness, (1 - share) * wall.offset)
         return Scene(
-            self.mesh, self.material, PointConstraints(self.matrix, share * self.load), cavity=cavity, tree=self.tree
+            self.mesh, self.material, ConstraintTerms(self.matrix, share * self.load), cavity=cavity, tree=self.tree
         )
 
 

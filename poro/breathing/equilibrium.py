@@ -35,19 +35,19 @@ class Balance(Enum):
 
 
 @dataclass(frozen=True)
-class PointConstraints:
+class ConstraintTerms:
     """Energy u K u / 2 - f u. matrix: (3n, 3n) kPa mm; force: (n, 3) kPa mm2."""
 
     matrix: csr_matrix
     force: Array
 
-    def __add__(self, other: PointConstraints) -> PointConstraints:
-        return PointConstraints((self.matrix + other.matrix).tocsr(), self.force + other.force)
+    def __add__(self, other: ConstraintTerms) -> ConstraintTerms:
+        return ConstraintTerms((self.matrix + other.matrix).tocsr(), self.force + other.force)
 
     @staticmethod
-    def none(nodes: int) -> PointConstraints:
+    def none(nodes: int) -> ConstraintTerms:
         """No constraint at all."""
-        return PointConstraints(csr_matrix((3 * nodes, 3 * nodes)), np.zeros((nodes, 3)))
+        return ConstraintTerms(csr_matrix((3 * nodes, 3 * nodes)), np.zeros((nodes, 3)))
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ class Scene:
 
     mesh: TetMesh
     material: ConstitutiveModel
-    constraints: PointConstraints
+    constraints: ConstraintTerms
     transpulmonary_kpa: float = 0.0
     cavity: Cavity | None = None
     tree: Tree | None = field(default=None, repr=False)

@@ -15,7 +15,7 @@ from scipy.sparse.csgraph import connected_components
 
 from poro.arrays import Array
 from poro.breathing.elastic import Side, caudal, depth_of
-from poro.breathing.equilibrium import PointConstraints, Scene, tree_of
+from poro.breathing.equilibrium import ConstraintTerms, Scene, tree_of
 from poro.breathing.inflation import Filled, fill_to
 from poro.fem.constitutive import ConstitutiveModel
 from poro.fem.hyperelastic import ogden_lung
@@ -77,7 +77,7 @@ class OneScan:
 
     mesh: TetMesh
     material: ConstitutiveModel
-    constraints: PointConstraints
+    constraints: ConstraintTerms
     pull: Array
     regions: Regions
     bulk_kpa: float
@@ -95,7 +95,7 @@ class OneScan:
             start = u * (share / before) if abs(before) > 1e-6 and abs(share / before) < 3 else u
             sag = depth_of(wanted / rest) * (1.0 if wanted < rest else -1.0)
             force = tension * self.pull + (wanted - rest) * self.wanted + sag * self.weight
-            constraints = PointConstraints(self.constraints.matrix, self.constraints.force + force)
+            constraints = ConstraintTerms(self.constraints.matrix, self.constraints.force + force)
             scene = Scene(self.mesh, self.material, constraints, tree=tree)
             filled = fill_to(scene, wanted, start)
             found.append(filled)
@@ -118,7 +118,7 @@ def one_scan(mesh: TetMesh, side: Side) -> OneScan:
     pull[nodes[where.diaphragm], 2] = feet * surface.node_areas[where.diaphragm]
     anchors = held + 1e-6 * tissue.young_kpa * np.cbrt(mesh.node_volumes)[:, None]
     matrix, wanted = _wall(mesh, side, where, feet)
-    constraints = PointConstraints((diags(anchors.ravel()) + matrix).tocsr(), np.zeros_like(mesh.points))
+    constraints = ConstraintTerms((diags(anchors.ravel()) + matrix).tocsr(), np.zeros_like(mesh.points))
     bulk = tissue.lame_kpa + 2 * tissue.shear_kpa / 3
     weight = np.zeros_like(mesh.points)
     weight[:, 1] = -MASS_KG * 1e9 * GRAVITY_KPA_PER_MM * mesh.node_volumes / mesh.volumes.sum()

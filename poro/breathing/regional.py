@@ -16,7 +16,7 @@ from scipy.sparse import coo_matrix, csr_matrix, diags
 from poro.arrays import Array
 from poro.breathing.cavity import rising
 from poro.breathing.elastic import Breathing, Lung, Side, caudal, hilum
-from poro.breathing.equilibrium import PointConstraints
+from poro.breathing.equilibrium import ConstraintTerms
 from poro.fem.constraints import point_constraints
 from poro.fem.forms import tangent_stiffness
 from poro.fem.tissue import Tissue
@@ -226,7 +226,7 @@ def _distances(
     return residual, slope, mean
 
 
-def _contact(scene: Thorax, u: Array) -> PointConstraints:
+def _contact(scene: Thorax, u: Array) -> ConstraintTerms:
     """Contact along the walls' normals that keeps the gap at rest between lung and walls, wherever the lung slid to."""
     border = scene.lung.boundary
     walls = scene.walls.moved(scene.walls.points + u[scene.walls.nodes])
@@ -245,7 +245,7 @@ def _contact(scene: Thorax, u: Array) -> PointConstraints:
     # Where a wall is missing, between chest and diaphragm, the nearest one is none of the lung's.
     area = border.moved(here).node_areas * (np.abs(scene.gap) < TOUCH_MM) * (np.abs(apart - scene.gap) < 2 * TOUCH_MM)
     stiffness = STICK_KPA_PER_MM * area[:, None, None] * normal[:, :, None] * normal[:, None, :]
-    return PointConstraints(*point_constraints(operator, stiffness, wanted[:, None] * normal))
+    return ConstraintTerms(*point_constraints(operator, stiffness, wanted[:, None] * normal))
 
 
 def _patch_forces(scene: Thorax, u: Array) -> Array:

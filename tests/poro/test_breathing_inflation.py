@@ -12,7 +12,7 @@ from poro.arrays import Array
 from poro.breathing import one_scan as module
 from poro.breathing.cavity import inflating
 from poro.breathing.elastic import WALL_ALONE, Lung
-from poro.breathing.equilibrium import Balance, PointConstraints, Scene, balance, volume
+from poro.breathing.equilibrium import Balance, ConstraintTerms, Scene, balance, volume
 from poro.breathing.inflation import Filled, fill, fill_to
 from poro.breathing.one_scan import _wall, one_scan, regions
 from poro.breathing.pressure_volume import PER_PA, inspired_volume, pressure_volume
@@ -24,7 +24,7 @@ TISSUE = Tissue()
 
 def free_scene(mesh: TetMesh, transpulmonary_kpa: float = 0.0) -> Scene:
     anchor = diags(np.full(3 * len(mesh.points), 1e-7)).tocsr()
-    return Scene(mesh, neo_hookean(TISSUE), PointConstraints(anchor, np.zeros_like(mesh.points)), transpulmonary_kpa)
+    return Scene(mesh, neo_hookean(TISSUE), ConstraintTerms(anchor, np.zeros_like(mesh.points)), transpulmonary_kpa)
 
 
 def pressure(s: float) -> float:
