@@ -229,12 +229,16 @@ def stability_choices_command(
 
 def calibrate_forecast(
     out: Annotated[Path, typer.Option("--out", metavar="FILE", help="JSON file of the persons; a rerun goes on.")],
-    persons: Annotated[int, typer.Option(metavar="N", min=5, help="Phantoms that are moved.")] = 36,
+    persons: Annotated[int, typer.Option(metavar="N", min=5, max=100, help="Phantoms of each anatomy.")] = 24,
+    right: Annotated[
+        list[Path] | None, typer.Option(metavar="CT", help="Scanned chest whose right lung is collapsed as well.")
+    ] = None,
+    left: Annotated[list[Path] | None, typer.Option(metavar="CT", help="The same of a left lung.")] = None,
 ) -> None:
     """Move phantoms by their physics, and write what `foresee` forecasts from."""
     from vatsloc.study.forecast import calibrate
 
-    calibrate(out, persons, say)
+    calibrate(out, persons, {"right": right or [], "left": left or []}, say)
     print(out)
 
 

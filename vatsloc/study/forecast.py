@@ -1,11 +1,13 @@
 """Calibrates the forecast of a collapse (vatsloc/workflow/forecast.py) by phantoms that are moved, but never imaged.
 
-Their persons and collapses are drawn anew, over the ranges of the suite's; the suite itself takes no part.
+Their persons and collapses are drawn anew, over the ranges of the suite's; the suite itself takes no part. Scanned
+chests may join them, collapsed by the same physics.
 """
 
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,16 +17,19 @@ from phantoms.recipes import SPECS, SUITE
 from phantoms.spec import Collapse, PhantomSpec
 from phantoms.states import make_states
 from phantoms.thorax import draw_thorax
+from phantoms.twin import Scan, twin_base
 from registration.volume import Array
 from vatsloc.evaluation.ellipsoid import in_ellipsoid
 from vatsloc.formats.casefile import PleuralGas
 from vatsloc.formats.folder import write_whole
+from vatsloc.frames import Side
+from vatsloc.synthetic import read_scan
 from vatsloc.workflow.forecast import calibrated_motions, forecast
 from vatsloc.workflow.pose import as_side
 from vatsloc.workflow.stages import Say, quiet
 
-FIRST_SEED = 3000
-"""Seeds of the suite and of what tests and studies draw lie below."""
+FIRST_SEED, SCAN_SEEDS = 3000, 100
+"""Seeds of the suite and of what tests and studies draw lie below; each scan's begin so many after those before."""
 EVERY_CO2 = 3
 """One person in so many is insufflated with carbon dioxide."""
 ELEMENT_MM = 18.0
@@ -37,13 +42,13 @@ def drawn_spec(seed: int) -> PhantomSpec:
     rng = np.random.default_rng([seed, 21])
     co2 = seed % EVERY_CO2 == 0
     collapse = Collapse(
-        inflated=rng.uniform(0.85, 0.91),
-        deflated=rng.uniform(0.40, 0.64),
+        inflated=rng.uniform(0.82, 0.91),
+        deflated=rng.uniform(0.25, 0.64),
         dome_rise=rng.uniform(-16.0, -12.0) if co2 else rng.uniform(3.0, 14.0),
-        shift=rng.uniform(11.0, 38.0),
+        shift=rng.uniform(7.0, 38.0),
         gas="co2" if co2 else "air",
         patchiness=rng.uniform(0.3, 1.0),
-        lobes_apart=rng.uniform(0.0, 0.1),
+        lobes_apart=rng.uniform(0.0, 0.3),
     )
     side, habitus = rng.choice(["right", "left"]), rng.choice(["average", "average", "obese"])
     return PhantomSpec(
@@ -51,17 +56,22 @@ def drawn_spec(seed: int) -> PhantomSpec:
     )
 
 
-def moved(seed: int) -> dict[str, Any]:
-    """One person's row: gas, and the best affine motion of the lung about its middle to either state against the spine,
-    with R counted towards the operated side; what is left over as a covariance, mm2.
+def moved(seed: int, scan: tuple[Scan, Side] | None = None) -> dict[str, Any]:
+    """One person's row: gas, anatomy, and the best affine motion of the lung about its middle to either state against
+    the spine, with R counted towards the operated side; what is left over as a covariance, mm2. scan: whose lung, and
+    which, that of a drawn person where it is None.
     """
     spec = drawn_spec(seed)
-    patient = draw_thorax(spec.side, spec.habitus, spec.lesion, seed, spec.fused).patient
+    if scan is None:
+        patient = draw_thorax(spec.side, spec.habitus, spec.lesion, seed, spec.fused).patient
+    else:
+        spec = replace(spec, side=scan[1], fused=1.0)
+        patient = twin_base(scan[0], spec, seed, np.random.default_rng([seed, 12])).patient
     states, _, _ = make_states(patient, spec, np.random.default_rng([seed, 11]))
     mirror = np.array([1.0 if spec.side == "right" else -1.0, 1, 1])
     ct = states[0].samples[patient.lung.sample(states[0].samples) < 0]
     about = (ct - ct.mean(axis=0)) * mirror
-    row: dict[str, Any] = {"seed": seed, "gas": spec.collapse.gas}
+    row: dict[str, Any] = {"seed": seed, "anatomy": "drawn" if scan is None else "scan", "gas": spec.collapse.gas}
     for name, state in zip(("inflated", "deflated"), states, strict=True):
         row[name] = affine_motion(about, (state.lung_map(ct) - ct) * mirror)
     return row
@@ -75,13 +85,23 @@ def affine_motion(about: Array, motion: Array) -> dict[str, Any]:
     return {"shift": best[0].tolist(), "gradient": best[1:].T.tolist(), "left": (left.T @ left / len(left)).tolist()}
 
 
-def calibrate(out: Path, persons: int, say: Say = quiet) -> None:
-    """Write the rows of so many persons to a JSON file; those that it holds are not made again."""
+def calibrate(out: Path, persons: int, scans: dict[Side, list[Path]], say: Say = quiet) -> None:
+    """Write the rows of so many drawn persons, and of so many collapses of each scanned chest, to a JSON file; those
+    that it holds are not made again. scans: the CTs, by the side of the lung to collapse.
+
+    Raises InputRefused where a scan does not show what is needed.
+    """
     rows = json.loads(out.read_text(encoding="utf-8")) if out.exists() else []
-    for seed in range(FIRST_SEED + len(rows), FIRST_SEED + persons):
-        say(f"person {seed} ...")
-        rows.append(moved(seed))
-        write_whole(out, "[\n" + ",\n".join(json.dumps(_rounded(row)) for row in rows) + "\n]\n")
+    made = {row["seed"] for row in rows}
+    given: list[tuple[Path, Side] | None] = [None, *((ct, side) for side, cts in scans.items() for ct in cts)]
+    for number, chest in enumerate(given):
+        first = FIRST_SEED + number * SCAN_SEEDS
+        seeds = [seed for seed in range(first, first + persons) if seed not in made]
+        scan = (read_scan(*chest), chest[1]) if chest is not None and seeds else None
+        for seed in seeds:
+            say(f"person {seed} ...")
+            rows.append(moved(seed, scan))
+            write_whole(out, "[\n" + ",\n".join(json.dumps(_rounded(row)) for row in rows) + "\n]\n")
 
 
 def _rounded(value: Any) -> Any:
