@@ -7,9 +7,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
+from functools import partial
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
@@ -17,6 +18,7 @@ from registration.images.interpolate import interpolate, warp_samples
 from registration.images.pyramid import Pyramid
 from registration.images.resample import coarsen, coarsen_mask
 from registration.kernels.correlation import coefficient
+from registration.kernels.threads import in_parts
 from registration.maps.rigid import RigidTransform
 from registration.terms.metrics import GlobalNcc
 from registration.volume import Array, Mask, Volume
@@ -176,7 +178,8 @@ def _coarse(
     target = level.moving.grid.to_ijk(initial(centre[None])[0] + shifts)
     scores = np.empty((len(rotations), len(shifts)), dtype=np.float32)
     unseen = np.where(level.seen.hu > 0.9, level.moving.hu, np.float32(2 * UNSEEN))
-    _scores(np.ascontiguousarray(unseen), base.astype(np.float32), target.astype(np.float32), level.values, scores)
+    single = base.astype(np.float32), target.astype(np.float32)
+    in_parts(partial(_scores, np.ascontiguousarray(unseen), *single, level.values, scores), len(target))
     kept: list[RigidTransform] = []
     for flat in np.argsort(-scores, axis=None)[:4000]:
         t, s = np.unravel_index(flat, scores.shape)
@@ -212,11 +215,11 @@ def _near_spine(spine: Mask, points: Array) -> Array:
     return np.asarray(squared <= NEAR_SPINE_MM**2)
 
 
-@njit(cache=True, parallel=True)
-def _scores(voxels, base, target, values, scores):
+@njit(cache=True, nogil=True)
+def _scores(voxels, base, target, values, scores, first, end):
     ni, nj, nk = voxels.shape
     rotations, n, _ = base.shape
-    for s in prange(target.shape[0]):
+    for s in range(first, end):
         for t in range(rotations):
             count, sf, sm, sff, smm, sfm = 0, 0.0, 0.0, 0.0, 0.0, 0.0
             for p in range(n):

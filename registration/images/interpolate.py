@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
+from registration.kernels.threads import MANY_POINTS, in_parts
 from registration.kernels.trilinear import lower, value, value_and_slope
 from registration.volume import Array, Grid
 
-THREADS_FROM = 30_000
-CHUNKS = 16
 EDGE = 1e-4
 """Voxels: as far outside an image a point still counts as on its edge, where the rounding of headers can put it."""
 
@@ -23,7 +23,7 @@ class _Samples(NamedTuple):
     gradient: Array
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _values(voxels, points, fill, out, start, stop):
     ni, nj, nk = voxels.shape
     for n in range(start, stop):
@@ -36,14 +36,7 @@ def _values(voxels, points, fill, out, start, stop):
         out[n] = value(voxels, i, j, k, x - i, y - j, z - k)
 
 
-@njit(cache=True, parallel=True)
-def _values_threads(voxels, points, fill, out):
-    n = points.shape[0]
-    for c in prange(CHUNKS):
-        _values(voxels, points, fill, out, n * c // CHUNKS, n * (c + 1) // CHUNKS)
-
-
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _warp(voxels, base, displacement, index, ijk_from_ras, out, start, stop):
     ni, nj, nk = voxels.shape
     for n in range(start, stop):
@@ -62,13 +55,6 @@ def _warp(voxels, base, displacement, index, ijk_from_ras, out, start, stop):
             out.gradient[m, n] = ijk_from_ras[0, m] * dx + ijk_from_ras[1, m] * dy + ijk_from_ras[2, m] * dz
 
 
-@njit(cache=True, parallel=True)
-def _warp_threads(voxels, base, displacement, index, ijk_from_ras, out):
-    n = base.shape[0]
-    for c in prange(CHUNKS):
-        _warp(voxels, base, displacement, index, ijk_from_ras, out, n * c // CHUNKS, n * (c + 1) // CHUNKS)
-
-
 def warp_samples(
     voxels: Array, base: Array, displacement: Array, index: Array, ijk_from_ras: Array
 ) -> tuple[Array, Array]:
@@ -79,10 +65,7 @@ def warp_samples(
     """
     n = len(base)
     out = _Samples(np.empty(n, dtype=displacement.dtype), np.empty((3, n), dtype=displacement.dtype))
-    if n > THREADS_FROM:
-        _warp_threads(voxels, base, displacement, index, ijk_from_ras, out)
-    else:
-        _warp(voxels, base, displacement, index, ijk_from_ras, out, 0, n)
+    in_parts(partial(_warp, voxels, base, displacement, index, ijk_from_ras, out), n, MANY_POINTS)
     return out.values, out.gradient
 
 
@@ -96,8 +79,5 @@ def interpolate(voxels: Array, grid: Grid, points_ras: Array, fill: float) -> Ar
     """Trilinear values (n,) float32 at points (n, 3) in RAS mm; `fill` outside the hull of the voxel centres."""
     points = np.ascontiguousarray(grid.to_ijk(np.asarray(points_ras, dtype=float)))
     out = np.empty(len(points), dtype=np.float32)
-    if len(points) > THREADS_FROM:
-        _values_threads(_checked(voxels), points, np.float32(fill), out)
-    else:
-        _values(_checked(voxels), points, np.float32(fill), out, 0, len(points))
+    in_parts(partial(_values, _checked(voxels), points, np.float32(fill), out), len(points), MANY_POINTS)
     return out

@@ -5,10 +5,13 @@ Arrays (ni, nj, nk) of bool in and out; spacing: (3,) mm.
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from scipy import ndimage
 
+from registration.kernels.threads import in_parts
 from registration.volume import Array, Cut
 
 
@@ -80,30 +83,29 @@ def _within(inside: Array, distance_mm: float, spacing: Array) -> Array:
         out = np.full_like(squared, np.inf)
         step = float(spacing[axis])
         if axis == 0:
-            _along_first(squared, int(reach[0]), step, out)
+            work = partial(_along_first, squared, int(reach[0]), step, out)
         else:
-            _along_others(squared, axis, int(reach[axis]), step, out)
+            work = partial(_along_others, squared, axis, int(reach[axis]), step, out)
+        in_parts(work, len(squared))
         squared = out
     return np.asarray(squared <= np.float32((distance_mm + 1e-4) ** 2))
 
 
 # Planes are named by number, not by slices: half the time that the kernels take to compile.
-@njit(cache=True, parallel=True)
-def _along_first(squared, reach, step, out):
+@njit(cache=True, nogil=True)
+def _along_first(squared, reach, step, out, first, end):
     n, nj, nk = squared.shape
-    for plane in prange(n):
-        i = np.int64(plane)  # unsigned until here
+    for i in range(first, end):
         _lower(out, squared, (i, 0, 0), (i, 0, 0), (nj, nk), np.float32(0))
         for o in range(-reach, reach + 1):
             if o != 0 and 0 <= i + o < n:
                 _lower(out, squared, (i, 0, 0), (i + o, 0, 0), (nj, nk), np.float32((o * step) ** 2))
 
 
-@njit(cache=True, parallel=True)
-def _along_others(squared, axis, reach, step, out):
-    ni, nj, nk = squared.shape
-    for plane in prange(ni):
-        i = np.int64(plane)
+@njit(cache=True, nogil=True)
+def _along_others(squared, axis, reach, step, out, first, end):
+    _, nj, nk = squared.shape
+    for i in range(first, end):
         _lower(out, squared, (i, 0, 0), (i, 0, 0), (nj, nk), np.float32(0))
         for o in range(1, reach + 1):
             rise = np.float32((o * step) ** 2)

@@ -7,15 +7,16 @@ used from a million products on; below that, waking them takes longer than the w
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from math import prod
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
+from registration.kernels.threads import in_parts
 from registration.volume import Array
 
 THREADS_FROM = 1_000_000
-CHUNKS = 16
 
 
 class Banded:
@@ -56,15 +57,13 @@ def along_axis(values: Array, axis: int, matrix: Banded) -> Array:
     out = np.empty((before, rows, after), dtype=values.dtype)
     flat = np.ascontiguousarray(values).reshape(before, s[axis], after)
     weights = matrix.weights_like(values)
-    many = out.size * weights.shape[1] > THREADS_FROM
-    if after == 1:
-        (_last_axis_threads if many else _last_axis)(flat, matrix.first, weights, out, 0, before)
-    else:
-        (_inner_axis_threads if many else _inner_axis)(flat, matrix.first, weights, out, 0, before * rows)
+    kernel, n = (_last_axis, before) if after == 1 else (_inner_axis, before * rows)
+    few = out.size * weights.shape[1] <= THREADS_FROM
+    in_parts(partial(kernel, flat, matrix.first, weights, out), n, n + 1 if few else 1)
     return out.reshape(*s[:axis], rows, *s[axis + 1 :])
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _inner_axis(values, first, weights, out, start, stop):
     rows, width = out.shape[1], out.shape[2]
     taps = weights.shape[1]
@@ -78,7 +77,7 @@ def _inner_axis(values, first, weights, out, start, stop):
                 out[p, r, q] += w * values[p, first[r] + k, q]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _last_axis(values, first, weights, out, start, stop):
     rows, taps = weights.shape
     for p in range(start, stop):
@@ -87,15 +86,3 @@ def _last_axis(values, first, weights, out, start, stop):
             for k in range(1, taps):
                 total += weights[r, k] * values[p, first[r] + k, 0]
             out[p, r, 0] = total
-
-
-@njit(cache=True, parallel=True)
-def _inner_axis_threads(values, first, weights, out, start, stop):
-    for c in prange(CHUNKS):
-        _inner_axis(values, first, weights, out, stop * c // CHUNKS, stop * (c + 1) // CHUNKS)
-
-
-@njit(cache=True, parallel=True)
-def _last_axis_threads(values, first, weights, out, start, stop):
-    for c in prange(CHUNKS):
-        _last_axis(values, first, weights, out, stop * c // CHUNKS, stop * (c + 1) // CHUNKS)

@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
-import numpy as np
-from numba import njit, prange
+from functools import partial
 
+import numpy as np
+from numba import njit
+
+from registration.kernels.threads import in_parts
 from registration.volume import Array
+
+THREADS_FROM = 32
+"""Planes: waking threads for fewer takes longer than they do."""
 
 
 def box_sums(values: Array, radius: int) -> Array:
     """Sums over the (2 radius + 1)^3 voxels around each voxel of (q, ni, nj, nk); outside counts as zero."""
     out = np.empty_like(values)
-    _sum_in_planes(values, radius, out)
-    _sum_across_planes(out, radius)
+    nq, ni, nj, _ = values.shape
+    in_parts(partial(_sum_in_planes, values, radius, out), nq * ni, THREADS_FROM)
+    in_parts(partial(_sum_across_planes, out, radius), nq * nj, THREADS_FROM)
     return out
 
 
@@ -22,10 +29,10 @@ def _add(sums, row, sign):
         sums[k] += sign * row[k]
 
 
-@njit(cache=True, parallel=True)
-def _sum_in_planes(values, radius, out):
-    nq, ni, nj, nk = values.shape
-    for t in prange(nq * ni):
+@njit(cache=True, nogil=True)
+def _sum_in_planes(values, radius, out, first, end):
+    _, ni, nj, nk = values.shape
+    for t in range(first, end):
         plane, rows = values[t // ni, t % ni], np.empty((nj, nk), dtype=values.dtype)
         for j in range(nj):
             run = 0.0
@@ -40,10 +47,10 @@ def _sum_in_planes(values, radius, out):
         _run_down(rows, radius, out[t // ni, t % ni])
 
 
-@njit(cache=True, parallel=True)
-def _sum_across_planes(values, radius):
-    nq, _, nj, _ = values.shape
-    for t in prange(nq * nj):
+@njit(cache=True, nogil=True)
+def _sum_across_planes(values, radius, first, end):
+    nj = values.shape[2]
+    for t in range(first, end):
         column = values[t // nj, :, t % nj]
         _run_down(column.copy(), radius, column)
 

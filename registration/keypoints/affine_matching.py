@@ -6,14 +6,15 @@ other has not, a correlation over whole blocks cannot tell.
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from numba import get_num_threads, njit
+from numba import njit
 
 from registration.kernels.correlation import coefficient
+from registration.kernels.threads import in_parts
 from registration.kernels.trilinear import value
 from registration.keypoints.matching import FLAT_HU, subvoxel_peak
 from registration.volume import Array
@@ -23,8 +24,6 @@ WIDTH = 2 * RADIUS + 1
 """Of a block, voxels; known when kernels are compiled, or they are five times slower."""
 LEAST_INSIDE = 0.35
 """Share of a block's voxels that have to lie inside in both images."""
-BATCH = 256
-"""Blocks that a thread matches at a time."""
 LEAST_NCC = 0.3
 """Below this there is no need to look for the way back."""
 
@@ -69,11 +68,7 @@ def match_affine_blocks(
     images = _centred(fixed), _centred(moving)
     where = np.ascontiguousarray(starts, np.int64), np.ascontiguousarray(affines, float)
 
-    def work(first: int) -> None:
-        _match_some(*images, where, reach, best, first, min(first + BATCH, n))
-
-    with ThreadPoolExecutor(get_num_threads()) as threads:  # a quarter of the compiling that `prange` takes
-        list(threads.map(work, range(0, n, BATCH)))
+    in_parts(partial(_match_some, *images, where, reach, best), n)
     offset, is_peak = subvoxel_peak(best.around)
     ncc = np.where(is_peak, best.around[:, 13], -1)
     return BlockMatches(best.shift + offset, ncc, np.linalg.norm(best.back, axis=1))

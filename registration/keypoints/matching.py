@@ -6,16 +6,18 @@ Ref: Foerstner & Guelch 1987 (keypoints); Ourselin 2001 (block matching, there a
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from registration.correspondences import Correspondences
 from registration.images.resample import resample, resample_mask
 from registration.kernels.correlation import coefficient
+from registration.kernels.threads import in_parts
 from registration.volume import Array, Mask, Volume
 
 FLAT_HU = 15.0
@@ -155,7 +157,7 @@ def _match_blocks(fixed: Volume, moving: Volume, starts: Array, search: _Search)
     level = np.float32(moving.hu.mean(dtype=float))
     f, m = (_Scales(hu, ndimage.gaussian_filter(hu, BLUR_VOXELS)) for hu in (fixed.hu - level, moving.hu - level))
     starts = np.ascontiguousarray(starts, np.int64)
-    _match_all(f, m, starts, search, shifts, around)
+    in_parts(partial(_match_all, f, m, starts, search, shifts, around), len(starts))
     offset, is_peak = subvoxel_peak(around)
     is_peak &= (np.abs(shifts) < search.reach).all(axis=1)
     return starts + shifts + offset, np.where(is_peak, around[:, 13], -1)
@@ -295,12 +297,12 @@ def _match(fixed, moving, start, search, best, around):
                 around[n] = near[n]
 
 
-@njit(cache=True, parallel=True)
-def _match_all(fixed, moving, starts, search, shifts, around):
-    """Fill shifts (n, 3) of the best blocks and the scores (n, 27) about them.
+@njit(cache=True, nogil=True)
+def _match_all(fixed, moving, starts, search, shifts, around, first, end):
+    """Fill shifts (n, 3) of the best blocks and the scores (n, 27) about them, for starts first..end.
 
     Every other voxel of the blurred images is compared at every other shift; the CANDIDATES best of these are refined
     with whole blocks.
     """
-    for n in prange(starts.shape[0]):
+    for n in range(first, end):
         _match(fixed, moving, starts[n], search, shifts[n], around[n])

@@ -8,12 +8,14 @@ airways. Ref: Heinrich 2013 (self-similarity context, quantized, compared by Ham
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
+from registration.kernels.threads import in_parts
 from registration.keypoints.matching import subvoxel_peak
 from registration.volume import Array
 
@@ -52,6 +54,15 @@ class Similar:
     is_inner: Array
 
 
+class _Found(NamedTuple):
+    """What `_search` fills. best: (n, 2) costs of the best and the next best shift (n, 3); around: (n, 27) costs about
+    the best."""
+
+    best: Array
+    shift: Array
+    around: Array
+
+
 class _Pair(NamedTuple):
     """What `_search` compares. fixed, moving: descriptions of two images, flat (n,); shape: (3,) of both; allowed:
     voxels of the moving one that count; block: (m, 3) voxels about a middle one; offsets: (m,) the same, flat.
@@ -72,7 +83,8 @@ def describe(hu: Array, needed: Array) -> Array:
     """
     out = np.zeros(hu.shape, np.uint64)
     padded = np.pad(np.asarray(hu, np.float32), RIM, mode="edge")
-    _describe(padded, np.ascontiguousarray(needed), _SIX[_PAIRS[:, 0]] * STEP, _SIX[_PAIRS[:, 1]] * STEP, out)
+    pairs = _SIX[_PAIRS[:, 0]] * STEP, _SIX[_PAIRS[:, 1]] * STEP
+    in_parts(partial(_describe, padded, np.ascontiguousarray(needed), pairs, out), len(out))
     return out
 
 
@@ -82,15 +94,15 @@ def find_similar(fixed: Array, moving: Array, allowed: Array, starts: Array, rea
     fixed, moving: descriptions of two images on one grid; allowed: voxels of the moving image that count.
     """
     n = len(starts)
-    best, shift = np.full((n, 2), NO_COST, np.float32), np.zeros((n, 3), np.int64)
-    around = np.full((n, 27), NO_COST, np.float32)
+    best, around = np.full((n, 2), NO_COST, np.float32), np.full((n, 27), NO_COST, np.float32)
+    found = _Found(best, np.zeros((n, 3), np.int64), around)
     _, nj, nk = fixed.shape
     offsets = (_BLOCK @ np.array([nj * nk, nk, 1])).astype(np.uint64)  # of unsigned indices numba asks no sign
     here, there = (np.ascontiguousarray(codes).ravel() for codes in (fixed, moving))
     pair = _Pair(here, there, np.array(fixed.shape), np.ascontiguousarray(allowed), _BLOCK, offsets)
-    _search(pair, np.ascontiguousarray(starts, np.int64), reach, best, shift, around)
+    in_parts(partial(_search, pair, np.ascontiguousarray(starts, np.int64), reach, found), len(starts))
     offset, is_top = subvoxel_peak(-around / NO_COST)
-    return Similar(shift + offset, best[:, 0], best[:, 1], is_top)
+    return Similar(found.shift + offset, best[:, 0], best[:, 1], is_top)
 
 
 @njit(cache=True)
@@ -118,9 +130,10 @@ def _differences(hu, i, j, start, stop, one, other, out):
                     out[k] += (p[k] - q[k]) ** 2
 
 
-@njit(cache=True, parallel=True)
-def _describe(padded, needed, first, second, out):
-    for i in prange(out.shape[0]):
+@njit(cache=True, nogil=True)
+def _describe(padded, needed, pairs, out, start_plane, end_plane):
+    first, second = pairs
+    for i in range(start_plane, end_plane):
         apart, own = np.empty((len(first), out.shape[2]), np.float32), np.empty(len(first), np.float32)
         for j in range(out.shape[1]):
             asked = np.flatnonzero(needed[i, j])
@@ -218,14 +231,14 @@ def _top(cost):
     return top // width**2, top // width % width, top % width
 
 
-@njit(cache=True, parallel=True)
-def _search(pair, starts, reach, best, shift, around):
-    """Fill costs (n, 2) of the best and the next best shift (n, 3), and the costs (n, 27) about the best.
+@njit(cache=True, nogil=True)
+def _search(pair, starts, reach, found, first, end):
+    """Fill what is found of starts first..end.
 
     Every other shift is compared, and all about the best of these.
     """
     width = 2 * reach + 1
-    for n in prange(starts.shape[0]):
+    for n in range(first, end):
         own = np.empty(len(pair.block) if _holds_block(pair.shape, starts[n]) else 0, np.uint64)
         for m in range(len(own)):
             own[m] = pair.fixed[_number(pair.shape, starts[n]) + pair.offsets[m]]
@@ -233,12 +246,12 @@ def _search(pair, starts, reach, best, shift, around):
         _fill(cost, pair, starts[n], own, ((reach, reach, reach), reach, 2))
         _fill(cost, pair, starts[n], own, (_top(cost), 3, 1))
         i, j, k = _top(cost)
-        best[n, 0] = cost[i, j, k]
-        shift[n, 0], shift[n, 1], shift[n, 2] = i - reach, j - reach, k - reach
+        found.best[n, 0] = cost[i, j, k]
+        found.shift[n, 0], found.shift[n, 1], found.shift[n, 2] = i - reach, j - reach, k - reach
         if min(i, j, k) > 0 and max(i, j, k) < width - 1:
             for m in range(27):
-                around[n, m] = cost[i - 1 + m // 9, j - 1 + m // 3 % 3, k - 1 + m % 3]
-        best[n, 1] = _least_elsewhere(cost, (i, j, k))
+                found.around[n, m] = cost[i - 1 + m // 9, j - 1 + m // 3 % 3, k - 1 + m % 3]
+        found.best[n, 1] = _least_elsewhere(cost, (i, j, k))
 
 
 @njit(cache=True)

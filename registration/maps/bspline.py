@@ -6,13 +6,14 @@ Ref: Rueckert 1999, eq. 1 (free-form deformation) and eq. 8 (bending energy).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from scipy import sparse
 
 from registration.kernels.banded import Banded, along_axes
+from registration.kernels.threads import MANY_POINTS, in_parts
 from registration.maps.field import DisplacementField
 from registration.volume import Array, Grid
 
@@ -47,7 +48,8 @@ class BSplineField:
         """u (n, 3) in mm at points (n, 3) in RAS mm."""
         points = np.ascontiguousarray(self.control.to_ijk(np.asarray(points_ras, dtype=float)))
         out = np.empty((len(points), 3))
-        _evaluate(np.ascontiguousarray(self.coefficients, dtype=float), points, out)
+        coefficients = np.ascontiguousarray(self.coefficients, dtype=float)
+        in_parts(partial(_evaluate, coefficients, points, out), len(points), MANY_POINTS)
         return out
 
     def __call__(self, points_ras: Array) -> Array:
@@ -145,10 +147,10 @@ def _subdivided(c: Array, axis: int) -> Array:
     return np.moveaxis(out, 0, axis)
 
 
-@njit(cache=True, parallel=True)
-def _evaluate(coefficients, points, out):
+@njit(cache=True, nogil=True)
+def _evaluate(coefficients, points, out, first, end):
     ni, nj, nk, _ = coefficients.shape
-    for n in prange(points.shape[0]):
+    for n in range(first, end):
         x = min(max(points[n, 0], 1.0), ni - 2.0)
         y = min(max(points[n, 1], 1.0), nj - 2.0)
         z = min(max(points[n, 2], 1.0), nk - 2.0)

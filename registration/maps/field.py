@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
+from registration.kernels.threads import MANY_POINTS, in_parts
 from registration.kernels.trilinear import lower, value
 from registration.volume import Array, Grid
 
@@ -48,7 +49,7 @@ class DisplacementField:
         vectors = self.vectors
         if 1 in self.grid.shape:  # a cell has two voxels along every axis
             vectors = np.pad(vectors, [(0, int(n == 1)) for n in vectors.shape], mode="edge")
-        _vectors(np.ascontiguousarray(vectors), points, out)
+        in_parts(partial(_vectors, np.ascontiguousarray(vectors), points, out), len(points), MANY_POINTS)
         return out
 
     def __call__(self, points_ras: Array) -> Array:
@@ -58,7 +59,8 @@ class DisplacementField:
     def jacobian_determinant(self) -> Array:
         """det(I + du/dx) on the voxels, (ni, nj, nk) float32, by central differences (one-sided at the border)."""
         out = np.empty(self.grid.shape, dtype=np.float32)
-        _determinant(np.ascontiguousarray(self.vectors), self.grid.ijk_from_ras[:3, :3], out)
+        kernel = partial(_determinant, np.ascontiguousarray(self.vectors), self.grid.ijk_from_ras[:3, :3], out)
+        in_parts(kernel, len(out))
         return out
 
 
@@ -88,10 +90,10 @@ def slabs(grid: Grid) -> Iterator[Array]:
         yield plane + i * a[:3, 0]
 
 
-@njit(cache=True, parallel=True)
-def _vectors(vectors, points, out):
+@njit(cache=True, nogil=True)
+def _vectors(vectors, points, out, first, end):
     ni, nj, nk, _ = vectors.shape
-    for n in prange(points.shape[0]):
+    for n in range(first, end):
         x = min(max(points[n, 0], 0.0), ni - 1.0)
         y = min(max(points[n, 1], 0.0), nj - 1.0)
         z = min(max(points[n, 2], 0.0), nk - 1.0)
@@ -100,10 +102,10 @@ def _vectors(vectors, points, out):
             out[n, m] = value(vectors[:, :, :, m], i, j, k, x - i, y - j, z - k)
 
 
-@njit(cache=True, parallel=True)
-def _determinant(vectors, ijk_from_ras, out):
+@njit(cache=True, nogil=True)
+def _determinant(vectors, ijk_from_ras, out, first, end):
     ni, nj, nk, _ = vectors.shape
-    for i in prange(ni):
+    for i in range(first, end):
         du, f = np.zeros((3, 3)), np.zeros((3, 3))
         i0, i1 = max(i - 1, 0), min(i + 1, ni - 1)
         for j in range(nj):

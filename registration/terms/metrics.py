@@ -9,14 +9,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from math import prod
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from registration.kernels.box_sums import box_sums
+from registration.kernels.threads import MANY_POINTS, in_parts
 from registration.volume import Array
 
 
@@ -111,7 +112,8 @@ class LocalNcc:
         sums = _MovingSums(*self._window_sums(w * m, w * m * m, w * f * m))
         scaled = w * f.dtype.type(1 / max(float(w.sum(dtype=np.float64)), 1e-3))
         parts, cc = np.empty((4, len(f)), dtype=f.dtype), np.empty_like(f)
-        _correlations(scaled, self._fixed_sums, sums, f.dtype.type(self.floor**2), parts, cc)
+        noise = f.dtype.type(self.floor**2)
+        in_parts(partial(_correlations, scaled, self._fixed_sums, sums, noise, parts, cc), len(f), MANY_POINTS)
 
         def derive() -> tuple[Array, Array]:
             sa, sb, sab, sh = self._window_sums(*parts)
@@ -128,17 +130,14 @@ class LocalNcc:
         return [row[self.index] for row in sums]
 
 
-@njit(cache=True, parallel=True)
-def _correlations(w, fixed, moving, noise, parts, cc):
+@njit(cache=True, nogil=True)
+def _correlations(w, fixed, moving, noise, parts, cc, first, end):
     """Fill cc (n,) with the correlation coefficients weighted by w (n,), and parts (4, n), of which their derivatives
-    are made.
-
-    They are summed elsewhere: a parallel loop's sum depends on the number of threads. An array in a named tuple must
-    not be filled here: numba takes a parallel loop's writes to it for dead code.
+    are made, from `first` to `end`. They are summed elsewhere: a sum over parts depends on the number of threads.
     """
     n, sf, sff = fixed.n, fixed.f, fixed.ff
     sm, smm, sfm = moving.m, moving.mm, moving.fm
-    for p in prange(len(w)):
+    for p in range(first, end):
         count = max(n[p], 1e-3)
         mean_f, mean_m = sf[p] / count, sm[p] / count
         vf = max(sff[p] - sf[p] * mean_f, 0.0) + count * noise
