@@ -85,12 +85,20 @@ def diaphragm_points(space: Mask, image: Volume, field: FieldOfView) -> SurfaceP
 
     space: lung and pleural air. Normals point down, out of the space; an empty set when the field ends above the dome.
     """
-    points, normals = _on_mask(space, DIAPHRAGM_SPACING_MM)
-    points, normals = _seen(points, normals, field)
+    points, normals = _seen(*_on_mask(space, DIAPHRAGM_SPACING_MM), field)
     outer = np.median(_along(image, points, normals, (4.0, 6.0, 8.0, 10.0)), axis=1)
     down = (normals[:, 2] < -0.5) & (outer > -200.0)
     down &= points[:, 2] < np.percentile(points[:, 2], 60.0) if len(points) else down
-    points, normals = points[down], normals[down]
+    return _against_flesh(image, points[down], normals[down])
+
+
+def inflated_surface(lung: Mask, image: Volume, field: FieldOfView) -> SurfacePoints:
+    """Surface of a lung that fills its cavity, where it was seen: about one point per `SPACING_MM`."""
+    return _against_flesh(image, *_seen(*_on_mask(lung, SPACING_MM), field))
+
+
+def _against_flesh(image: Volume, points: Array, normals: Array) -> SurfacePoints:
+    """Points of a border between lung and soft tissue, moved to where HU crosses half-way."""
     inner = np.median(_along(image, points, normals, (-5.0, -4.0, -3.0)), axis=1)
     shift, crossed = _half_way(image, points, normals, inner, np.zeros(len(points), dtype=bool))
     confidence = np.where(crossed, 1.0, 0.5)

@@ -20,6 +20,7 @@ from registration.spine import RigidFit, SpineSearch, register_spine
 from registration.volume import Array, Mask
 from vatsloc.case import CaseBefore
 from vatsloc.imaging.lungs import Side
+from vatsloc.imaging.surface import inflated_surface
 from vatsloc.imaging.thorax import carry_prior, inflated_lung, require_share, visible_share
 from vatsloc.maps import MeshMap
 from vatsloc.workflow.choices import Choice, weigh
@@ -138,7 +139,13 @@ def change_of_pose(
             to_inflated = MeshMap(mesh, points, inf_from_ct_rigid)
             refinement = refine_by_blocks(
                 Compared(case.ct, prepared.lung_ct, prepared.inflated, lung_inf),
-                Shape(placed, to_inflated, np.flatnonzero(seen & (depth_of_nodes(mesh) > DEEP_MM)), DEEP_MM),
+                Shape(
+                    placed,
+                    to_inflated,
+                    np.flatnonzero(seen & (depth_of_nodes(mesh) > DEEP_MM)),
+                    DEEP_MM,
+                    inflated_surface(lung_inf, prepared.inflated.volume, prepared.inflated.field),
+                ),
                 settings.refinement,
             )
         points = refinement.points

@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from poro.fem import Tissue
 from poro.fit import PointConstraints, elastic_correction
@@ -22,6 +23,7 @@ from registration.keypoints.aligned_matching import AlignedSettings, Regions, ma
 from registration.keypoints.matching import MatchSettings, detect_inside
 from registration.volume import Array, Mask, Volume
 from vatsloc.imaging.cbct import PreparedCbct
+from vatsloc.imaging.surface import SPACING_MM, SurfacePoints
 from vatsloc.maps import MeshMap
 from vatsloc.workflow.hold_out import held_out, too_few
 from vatsloc.workflow.settings import RefinementSettings
@@ -37,6 +39,9 @@ SIGMA_MM, STRAIN = (1.0, 2.0), 0.01
 (`elastic_correction`). Deep in the lung what came before is as sure as a block."""
 SHALLOW_MM, DEEP_MM = 8.0, 20.0
 """Where the one ends and the other begins."""
+WALL_SIGMA_MM, WALL_REACH_MM, WALL_ALONG = 2.0, 5.0, 0.7
+"""Standard deviation of where a lung that fills its cavity touches the wall; how far a node of its surface may be off,
+and the least cosine between both normals: beyond, the nearest wall is likelier another one."""
 ANCHOR_SIGMA_MM = 0.2
 """Standard deviation of nodes that other evidence has placed."""
 HALVINGS = 20
@@ -58,13 +63,15 @@ class Compared:
 @dataclass(frozen=True)
 class Shape:
     """A lung in a scan. rest: undeformed, in the scan's frame; map: from the CT, with the same tetrahedra; anchors:
-    (k,) nodes that other evidence has placed; within_mm: how deep below the pleura blocks are followed.
+    (k,) nodes that other evidence has placed; within_mm: how deep below the pleura blocks are followed; wall: what its
+    surface touches in the scan, None where it need not touch anything.
     """
 
     rest: TetMesh
     map: MeshMap
     anchors: Array
     within_mm: float = float("inf")
+    wall: SurfacePoints | None = None
 
     def moved(self, points: Array) -> Shape:
         """The same lung with its nodes at points (n, 3) mm of the scan."""
@@ -168,19 +175,39 @@ def _depth(mesh: TetMesh, points: Array) -> Array:
 
 
 def _followed(shape: Shape, matches: Correspondences) -> Shape:
-    """The lung after it followed matches."""
+    """The lung after it followed matches, and its wall."""
     anchors, rest, now = shape.anchors, shape.rest, shape.map.moved
     at = MeshMap(shape.map.mesh, rest.points, shape.map.around)(matches.moving)
     offset, k = matches.fixed - shape.map(matches.moving), len(anchors)
     sigma_mm = np.interp(_depth(shape.map.mesh, matches.moving), (SHALLOW_MM, DEEP_MM), SIGMA_MM)
+    nodes, gap, normals = _off_wall(shape)
     wanted = PointConstraints(
-        np.concatenate([at, rest.points[anchors]]),
-        np.concatenate([offset, np.zeros((k, 3))]),
-        np.concatenate([sigma_mm, np.full(k, ANCHOR_SIGMA_MM)]),
-        np.zeros((len(at) + k, 3)),
+        np.concatenate([at, rest.points[anchors], rest.points[nodes]]),
+        np.concatenate([offset, np.zeros((k, 3)), gap[:, None] * normals]),
+        np.concatenate([sigma_mm, np.full(k, ANCHOR_SIGMA_MM), np.full(len(nodes), WALL_SIGMA_MM)]),
+        np.concatenate([np.zeros((len(at) + k, 3)), normals]),
     )
     field = elastic_correction(rest, now - rest.points, Tissue(), wanted, model_sigma=STRAIN, rounds=1).u
     return shape.moved(now + unfolded(now, field, rest.tets))
+
+
+def _off_wall(shape: Shape) -> tuple[Array, Array, Array]:
+    """Nodes (k,) of the lung's surface, how far (k,) mm each is from the wall along its normal (k, 3).
+
+    Their median is taken off: what all share is where either image's border was drawn, not motion.
+    """
+    if shape.wall is None or len(shape.wall) == 0:
+        return np.zeros(0, dtype=int), np.zeros(0), np.zeros((0, 3))
+    border, wall = TetMesh(shape.map.moved, shape.map.mesh.tets).boundary, shape.wall
+    nearest = cKDTree(wall.points).query(border.points)[1]
+    normals = wall.normals[nearest]
+    off = wall.points[nearest] - border.points
+    gap = np.einsum("nd,nd->n", off, normals)
+    facing = np.einsum("nd,nd->n", border.node_normals, normals) > WALL_ALONG
+    near = facing & (np.abs(gap) < WALL_REACH_MM) & (np.linalg.norm(off, axis=1) < WALL_REACH_MM + SPACING_MM)
+    if not near.any():
+        return np.zeros(0, dtype=int), np.zeros(0), np.zeros((0, 3))
+    return border.nodes[near], gap[near] - np.median(gap[near]), normals[near]
 
 
 def unfolded(points: Array, field: Array, tets: Array) -> Array:
