@@ -18,7 +18,7 @@ from vatsloc.imaging.cbct import PreparedCbct, prepare_cbct
 from vatsloc.imaging.hilum import track_hilum
 from vatsloc.imaging.lungs import segment_lungs
 from vatsloc.imaging.pleura import Pneumothorax, _large_pieces, _lung_beside, air_limit, find_pneumothorax
-from vatsloc.imaging.surface import Border, deflated_surface, diaphragm_points
+from vatsloc.imaging.surface import Border, deflated_surface, diaphragm_points, inflated_surface
 from vatsloc.imaging.thorax import ThoraxPrior, carry_prior, inflated_lung, require_share, visible_share
 
 SHRUNK = 0.72
@@ -177,6 +177,22 @@ def test_diaphragm_is_the_lower_border_of_the_space(found: Pneumothorax, deflate
     y = (dome.points - known.CENTRES["right"]) / known.HALF_AXES
     f = np.linalg.norm(y, axis=1)
     assert np.median(np.abs(f * (f - 1) / np.linalg.norm(y / known.HALF_AXES, axis=1))) < 1.0
+
+
+def test_the_inflated_lung_s_surface_is_seen_where_the_scan_shows_it() -> None:
+    cbct = prepare_cbct(known.cone_beam(known.thorax().volume, (50.0, 0.0), 110.0))
+    lung = known.thorax().lungs["right"]
+    surface = inflated_surface(lung, cbct.volume, cbct.field)
+    assert len(surface) > 500
+    y = (surface.points - known.CENTRES["right"]) / known.HALF_AXES
+    f = np.linalg.norm(y, axis=1)
+    slope = y / known.HALF_AXES
+    assert np.median(np.abs(f * (f - 1) / np.linalg.norm(slope, axis=1))) < 0.6
+    outward = (surface.normals * slope).sum(axis=1) / np.linalg.norm(slope, axis=1)
+    assert np.median(outward) > 0.98
+    assert (surface.border == Border.CONTACT).all()
+    ijk = np.rint(cbct.field.usable.grid.to_ijk(surface.points)).astype(int)
+    assert cbct.field.usable.inside[tuple(ijk.T)].all()
 
 
 @pytest.mark.parametrize("shift", [(8.0, -4.0, 6.0), (0.0, 0.0, 0.0), (-10.0, 5.0, -7.5)])

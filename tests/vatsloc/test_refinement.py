@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
-from numpy.testing import assert_array_equal
+from numpy.testing import assert_allclose, assert_array_equal
 
-from poro.mesh.tetmesh import signed_volumes
+from poro.mesh.tetmesh import TetMesh, signed_volumes
 from registration.correspondences import Correspondences
 from registration.volume import Array, Mask
 from tests.vatsloc import ball_scene as scene
+from vatsloc.imaging.surface import Border, SurfacePoints
 from vatsloc.maps import MeshMap
 from vatsloc.workflow import refinement as module
 from vatsloc.workflow.refinement import Compared, Shape, refine_by_blocks
@@ -58,6 +60,55 @@ def test_the_lung_follows_blocks_up_to_the_pleura() -> None:
     assert first.kept
     assert first.after_mm < first.before_mm
     assert (signed_volumes(found.points, Lung.mesh.tets) > 0).all()
+
+
+def wall_of(points: Array, normals: Array) -> SurfacePoints:
+    return SurfacePoints(points, normals, np.ones(len(points)), np.full(len(points), Border.CONTACT))
+
+
+def test_a_lung_beside_its_wall_is_drawn_to_it_along_the_normal_alone() -> None:
+    """A surface that is shifted by 2 mm in x, 1 mm too large, with one part 8 mm off and one that faces away."""
+    truth = TetMesh(Lung.truth, Lung.mesh.tets).boundary
+    normals = truth.node_normals.copy()
+    outside = truth.points - 1.0 * normals
+    height = truth.points[:, 2]
+    far, turned = height > np.quantile(height, 0.8), height < np.quantile(height, 0.2)
+    outside[far] += 8.0 * normals[far]
+    normals[turned] *= -1
+    shift = np.array([2.0, 0, 0])
+    moved = MeshMap(Lung.mesh, Lung.truth + shift, AROUND)
+    shape = Shape(Lung.rest, moved, np.zeros(0, int), wall=wall_of(outside, normals))
+    nodes, gap, along = module._off_wall(shape)
+    top, bottom = height > np.quantile(height, 0.97), height < np.quantile(height, 0.03)
+    assert not np.isin(truth.nodes[top | bottom], nodes).any()
+    assert np.isin(truth.nodes[~far & ~turned], nodes).mean() > 0.9
+    row = {node: n for n, node in enumerate(truth.nodes)}
+    own = truth.node_normals[[row[node] for node in nodes]]
+    straight = np.einsum("nd,nd->n", along, own) > 0.999  # the nearest point is the node's own
+    assert straight.mean() > 0.3
+    expected = -1.0 - own[straight] @ shift
+    assert_allclose(gap[straight] - gap[straight].mean(), expected - expected.mean(), atol=0.05)
+    assert abs(np.median(gap)) < 1e-12
+
+
+def test_without_a_wall_in_reach_nothing_is_drawn() -> None:
+    nowhere = Lung.truth[:50] + 300.0
+    for wall in (None, wall_of(nowhere[:0], nowhere[:0]), wall_of(nowhere, np.tile([1.0, 0, 0], (50, 1)))):
+        nodes, gap, normals = module._off_wall(replace(Lung.shape(np.zeros(0, int)), wall=wall))
+        assert (len(nodes), len(gap), normals.shape) == (0, 0, (0, 3))
+
+
+def test_the_wall_brings_the_surface_nearer_than_blocks_alone() -> None:
+    border = TetMesh(Lung.truth, Lung.mesh.tets).boundary
+    shape = Lung.shape(np.zeros(0, int))
+    alone = refine_by_blocks(compared(), shape, ON)
+    held = refine_by_blocks(compared(), replace(shape, wall=wall_of(border.points, border.node_normals)), ON)
+
+    def off_surface(points: Array) -> float:
+        return float(np.abs(((points - Lung.truth)[border.nodes] * border.node_normals).sum(axis=1)).mean())
+
+    assert off_surface(held.points) < 0.8 * off_surface(alone.points)
+    assert Lung.error(held.points)[Lung.depth > 8.0].mean() < 1.1 * Lung.error(alone.points)[Lung.depth > 8.0].mean()
 
 
 def test_anchors_stay_and_deep_blocks_are_left_out() -> None:
