@@ -151,12 +151,6 @@ class LinearizedContact:
         """Motion (r,) along the terms of the geometric stiffness when no contact force acts."""
         return self.stiffness.project(self.free - self.u)
 
-    @cached_property
-    def _response(self) -> Array:
-        """Displacements (s, 3 nc) of all contact nodes under a unit force at each gap between pieces."""
-        own = self.compliance.matrix
-        return np.zeros((0, len(own))) if self.between is None else np.asarray(self.between.matrix @ own)
-
     def within(self, active: Array) -> Array:
         """An active set (nc + s,) without gaps of nodes that face nothing any more."""
         return active if self.between is None else active & np.concatenate([self.gap < np.inf, self.between.meets])
@@ -176,7 +170,8 @@ class LinearizedContact:
         rows = pool[len(at_wall) :] - len(self.gap)
         if self.between is None or not len(rows):
             return matrix, offset, coupling
-        response, gradients = self._response[rows], self.between.matrix[rows]
+        gradients, moved = self.between.matrix[rows], self.compliance.matrix
+        response = np.asarray(gradients.astype(moved.dtype) @ moved, dtype=float)
         crossed = np.einsum("knd,nd->kn", response.reshape(len(rows), -1, 3)[:, at_wall], n)
         among = np.asarray(gradients @ response.T)
         return (

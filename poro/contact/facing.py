@@ -15,7 +15,8 @@ from poro.arrays import Array
 from poro.contact.mortar import Reach, mortar
 from poro.mesh.tetmesh import TriSurface
 
-REACH = Reach(apart=25.0, deep=25.0)
+REACH = Reach(apart=10.0, deep=10.0)
+"""Deeper in each other, a thin piece's back would be taken for a front."""
 LEAST_SHARE = 0.05
 """Of the area about a node, what has to lie above the other surface for the node to have a gap."""
 FAR_MM = 1e3
@@ -37,6 +38,11 @@ class Gaps:
         """Nodes (s,) bool that face the other surface."""
         return self.area > 0
 
+    @property
+    def overlap_mm3(self) -> float:
+        """Volume in which the surfaces lie in each other."""
+        return float(self.area @ np.maximum(-self.gap, 0))
+
 
 @dataclass(frozen=True)
 class Facing:
@@ -54,6 +60,14 @@ class Facing:
     def of(rest: Array, first: Array, second: Array, reach: Reach = REACH) -> Facing:
         """Two surfaces; where they share nodes they have grown together, and no gap is asked for."""
         return Facing(rest, first, second, np.setdiff1d(first, second), reach)
+
+    def among(self, nodes: Array) -> Facing:
+        """The surfaces between some of the contact nodes (k,) alone, sorted, numbered anew."""
+        place = np.full(len(self.rest), -1)
+        place[nodes] = np.arange(len(nodes))
+        first, second = (place[t][(place[t] >= 0).all(axis=1)] for t in (self.first, self.second))
+        shared = np.intersect1d(self.first, self.second)
+        return Facing(self.rest[nodes], first, second, np.setdiff1d(first, place[shared]), self.reach)
 
     def gaps(self, u: Array) -> Gaps:
         """Weighted gaps at displacements u (nc, 3) mm, linearized with normals and overlap as they are there."""

@@ -19,8 +19,9 @@ from scipy.spatial import cKDTree
 
 from poro.arrays import Array
 
-OPPOSED = -0.3
-"""Two triangles face each other where the product of their unit normals is below this."""
+OPPOSED = -0.7
+"""Two triangles face each other where the product of their unit normals is below this: 45 degrees. Beyond that, sharp
+rims that lie beside each other would count as overlapping."""
 LEAST_COVERED = 0.02
 """Of a triangle, by the determinant of its mass matrix; where less is covered, dual weights would extrapolate."""
 FULL = 0.5  # that determinant of a triangle covered whole, its mean diagonal entry being one
@@ -51,8 +52,10 @@ def mortar(points: Array, first: Array, second: Array, reach: Reach) -> Mortar:
     farther apart nor deeper in each other than `reach` allows.
     """
     x, y = points[first], points[second]
-    pairs = _near(x, y, max(reach))
-    own, other = _integrals(x, y, pairs, np.array(reach))
+    pairs, frames = _near(x, y, reach)
+    own, other = _integrals(x, y, pairs, frames, np.array(reach))
+    common = own.any(axis=(1, 2))
+    pairs, own, other = pairs[common], own[common], other[common]
     mass = np.zeros((len(first), 3, 3))
     np.add.at(mass, pairs[:, 0], own)
     weight = mass.sum(axis=2)
@@ -77,21 +80,28 @@ def _dual(mass: Array, weight: Array) -> Array:
     return result
 
 
-def _near(x: Array, y: Array, reach: float) -> Array:
-    """Pairs (k, 2) of triangles x (s, 3, 3) and y (t, 3, 3) whose bounding spheres come within `reach`."""
+def _near(x: Array, y: Array, reach: Reach) -> tuple[Array, Array]:
+    """Pairs (k, 2) of triangles x (s, 3, 3) and y (t, 3, 3) that face each other within reach, and a frame (s, 3, 3)
+    of each triangle x: two directions along it and its normal.
+    """
     if not len(x) or not len(y):
-        return np.zeros((0, 2), np.int64)
+        return np.zeros((0, 2), np.int64), np.zeros((0, 3, 3))
+    along = _unit(x[:, 1] - x[:, 0])
+    normal, other = (_unit(np.cross(t[:, 1] - t[:, 0], t[:, 2] - t[:, 0])) for t in (x, y))
     centres, others = x.mean(axis=1), y.mean(axis=1)
-    radii = np.linalg.norm(x - centres[:, None], axis=2).max(axis=1)
-    widest = np.linalg.norm(y - others[:, None], axis=2).max()
-    found = cKDTree(others).query_ball_point(centres, radii + widest + reach)
-    counts = [len(near) for near in found]
-    return np.stack([np.repeat(np.arange(len(x)), counts), np.concatenate(found).astype(np.int64)], axis=1)
+    radii, widths = (np.linalg.norm(t - t.mean(axis=1)[:, None], axis=2).max(axis=1) for t in (x, y))
+    found = cKDTree(others).query_ball_point(centres, radii + widths.max() + max(reach))
+    i, j = np.repeat(np.arange(len(x)), [len(near) for near in found]), np.concatenate(found).astype(np.int64)
+    apart = others[j] - centres[i]
+    height = np.einsum("kd,kd->k", apart, normal[i])
+    aside = np.linalg.norm(apart - height[:, None] * normal[i], axis=1)
+    near = (np.einsum("kd,kd->k", normal[i], other[j]) < OPPOSED) & (aside < radii[i] + widths[j])
+    near &= (height < reach.apart + widths[j]) & (height > -reach.deep - widths[j])
+    return np.stack([i[near], j[near]], axis=1), np.stack([along, np.cross(normal, along), normal], axis=1)
 
 
-@njit(cache=True)
-def _cross(a: Array, b: Array) -> Array:
-    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+def _unit(vectors: Array) -> Array:
+    return vectors / np.linalg.norm(vectors, axis=1)[:, None]
 
 
 @njit(cache=True)
@@ -135,33 +145,32 @@ def _clipped(polygon: Array, corners: Array, spare: Array) -> int:
 
 
 @njit(cache=True)
-def _integrals(x: Array, y: Array, pairs: Array, reach: Array) -> tuple[Array, Array]:
+def _integrals(x: Array, y: Array, pairs: Array, frames: Array, reach: Array) -> tuple[Array, Array]:
     """Products of shape functions (k, 3, 3) mm2 of pairs of triangles: x with x, and x with y, over what is common."""
     own, other = np.zeros((len(pairs), 3, 3)), np.zeros((len(pairs), 3, 3))
-    flat_x, flat_y = np.empty((3, 2)), np.empty((3, 2))
+    flat_x, flat_y, height = np.empty((3, 2)), np.empty((3, 2)), np.empty(3)
     polygon, spare = np.empty((MOST_CORNERS, 2)), np.empty((MOST_CORNERS, 2))
     mid, on_x, on_y = np.empty((3, 2)), np.empty(3), np.empty(3)
     for k in range(len(pairs)):
-        a, b = x[pairs[k, 0]], y[pairs[k, 1]]
-        n, m = _cross(a[1] - a[0], a[2] - a[0]), _cross(b[1] - b[0], b[2] - b[0])
-        n /= np.sqrt((n * n).sum())
-        m /= np.sqrt((m * m).sum())
-        if (n * m).sum() > OPPOSED:
-            continue
-        e = a[1] - a[0]
-        e /= np.sqrt((e * e).sum())
-        f = _cross(n, e)
-        height = np.empty(3)
+        a, b, frame = x[pairs[k, 0]], y[pairs[k, 1]], frames[pairs[k, 0]]
         for c in range(3):
-            p, q = a[c] - a[0], b[2 - c] - a[0]  # the other one seen from behind, so that it turns the same way
-            flat_x[c, 0], flat_x[c, 1] = (p * e).sum(), (p * f).sum()
-            flat_y[c, 0], flat_y[c, 1] = (q * e).sum(), (q * f).sum()
-            height[c] = (q * n).sum()
+            # The other triangle is seen from behind, so that it turns the same way.
+            height[c] = 0.0
+            for axis in range(2):
+                flat_x[c, axis] = flat_y[c, axis] = 0.0
+            for d in range(3):
+                p, q = a[c, d] - a[0, d], b[2 - c, d] - a[0, d]
+                height[c] += q * frame[2, d]
+                for axis in range(2):
+                    flat_x[c, axis] += p * frame[axis, d]
+                    flat_y[c, axis] += q * frame[axis, d]
             polygon[c, 0], polygon[c, 1] = flat_y[c, 0], flat_y[c, 1]
         count = _clipped(polygon, flat_x, spare)
         if count < 3:
             continue
-        mx, my = polygon[:count, 0].mean(), polygon[:count, 1].mean()
+        mx = my = 0.0
+        for c in range(count):
+            mx, my = mx + polygon[c, 0] / count, my + polygon[c, 1] / count
         w0, w1, w2 = _barycentric(flat_y, mx, my)
         gap = w0 * height[0] + w1 * height[1] + w2 * height[2]
         if gap > reach[0] or gap < -reach[1]:
@@ -170,9 +179,10 @@ def _integrals(x: Array, y: Array, pairs: Array, reach: Array) -> tuple[Array, A
             ux, uy = polygon[c, 0] - polygon[0, 0], polygon[c, 1] - polygon[0, 1]
             vx, vy = polygon[c + 1, 0] - polygon[0, 0], polygon[c + 1, 1] - polygon[0, 1]
             weight = (ux * vy - uy * vx) / 6  # of a middle of a side: exact for products of two linear functions
-            mid[0] = (polygon[0] + polygon[c]) / 2
-            mid[1] = (polygon[c] + polygon[c + 1]) / 2
-            mid[2] = (polygon[c + 1] + polygon[0]) / 2
+            for axis in range(2):
+                mid[0, axis] = (polygon[0, axis] + polygon[c, axis]) / 2
+                mid[1, axis] = (polygon[c, axis] + polygon[c + 1, axis]) / 2
+                mid[2, axis] = (polygon[c + 1, axis] + polygon[0, axis]) / 2
             for s in range(3):
                 on_x[0], on_x[1], on_x[2] = _barycentric(flat_x, mid[s, 0], mid[s, 1])
                 on_y[2], on_y[1], on_y[0] = _barycentric(flat_y, mid[s, 0], mid[s, 1])
