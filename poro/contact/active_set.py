@@ -90,8 +90,9 @@ def solve_contact(
 ) -> ContactState:
     """Contact forces that keep every node in front of the wall, for the displacements `free` (nc, 3) without any wall.
 
-    facing: two surfaces among the contact nodes that may not pass through each other either. The gap is linearized where the nodes are and one exchange of the active set made, until no node moves by more than
+    The gap is linearized where the nodes are and one exchange of the active set made, until no node moves by more than
     `tolerance_mm` and the set stays; where that takes long, every linear complementarity problem is solved to its end.
+    facing: two surfaces among the contact nodes that may not pass through each other either.
     """
     u = start.u if start else np.zeros_like(free)
     rows = len(free) + (len(facing.nodes) if facing else 0)

@@ -78,7 +78,10 @@ class Facing:
         area = found.own[self.nodes]
         area = np.where(area > LEAST_SHARE * around, area, 0.0)
         meets = area > 0
-        weights = diags(np.where(meets, 1 / np.where(meets, area, 1), 0)) @ (found.other - diags(found.own)).tocsr()[self.nodes]
+        weights = (
+            diags(np.where(meets, 1 / np.where(meets, area, 1), 0))
+            @ (found.other - diags(found.own)).tocsr()[self.nodes]
+        )
         blocks = weights.tocsr()
         blocks.eliminate_zeros()
         rows = np.repeat(np.arange(count), np.diff(blocks.indptr))

@@ -30,7 +30,7 @@ from poro.mesh.pieces import Pieces
 NEAR_MM = 15.0
 """How far from an overlap nodes take part in contact."""
 TOLERANCE_MM = 0.05
-"""Largest last motion of a contact node; where a wall is rough, facets that come and go move some by 0.01 mm for ever."""
+"""Largest last motion of a contact node; facets that come and go may move some by 0.01 mm for ever."""
 
 
 @dataclass(frozen=True)

@@ -33,9 +33,7 @@ class Pair:
     def of(first: TetMesh, second: TetMesh, touching: Array) -> Pair:
         """Two meshes, and which nodes (n,) bool of both may touch."""
         count = len(first.points)
-        mesh = TetMesh(
-            np.concatenate([first.points, second.points]), np.concatenate([first.tets, second.tets + count])
-        )
+        mesh = TetMesh(np.concatenate([first.points, second.points]), np.concatenate([first.tets, second.tets + count]))
         faces = mesh.boundary.nodes[mesh.boundary.triangles]
         faces = faces[touching[faces].all(axis=1)]
         place = np.full(len(mesh.points), -1)
@@ -69,7 +67,7 @@ class Pair:
 def stacked(cells: tuple[tuple[int, int, int], ...], width: float, heights: tuple[float, float], turn: Array) -> Pair:
     """A box of some cells on top of another one, both of one width, mm, turned by `turn` (3, 3)."""
     first, second = (box(c, (width, width, h)) for c, h in zip(cells, heights, strict=True))
-    raised = second.points + [0, 0, heights[0]]
+    raised = second.points + heights[0] * np.eye(3)[2]
     touching = np.concatenate([first.points[:, 2], raised[:, 2]]) == heights[0]
     return Pair.of(TetMesh(first.points @ turn.T, first.tets), TetMesh(raised @ turn.T, second.tets), touching)
 
@@ -119,7 +117,7 @@ class Spheres:
             x, far = block.points, 4 * self.contact * (1 - 1e-9)
             outer = (np.abs(x[:, :2]).max(axis=1) >= far) | (x[:, 2] <= -far)
             bowed = x - np.outer((x[:, :2] ** 2).sum(axis=1) / (2 * self.radii[number]), [0, 0, 1.0])
-            moved = half_space(x[outer], self.contact, self.peak, self.tissue) + [0, 0, self.approach / 2]
+            moved = half_space(x[outer], self.contact, self.peak, self.tissue) + self.approach / 2 * np.eye(3)[2]
             bodies.append(TetMesh(bowed @ frame.T, block.tets))
             held.append(outer)
             motion.append(moved @ frame.T)

@@ -51,7 +51,9 @@ def main(source: str, target: str) -> None:
     model.add_initialized_data("shear", float(data["shear"]))
     bodies = []
     for number in (0, 1):
-        mesh, field, scalar, node_of = body(*(data[f"{name}{number}"] for name in ("points", "tets", "held", "touching")))
+        mesh, field, scalar, node_of = body(
+            *(data[f"{name}{number}"] for name in ("points", "tets", "held", "touching"))
+        )
         rule = gf.MeshIm(mesh, gf.Integ("IM_TETRAHEDRON(6)"))
         name = f"u{number}"
         model.add_fem_variable(name, field)

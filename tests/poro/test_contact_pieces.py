@@ -113,7 +113,9 @@ def test_stress_is_constant_across_meshes_that_do_not_match(turn: Array, swapped
     strain = push / sum(HEIGHTS)
     assert_allclose(state.force[len(pair.nodes) :] / state.between.area, tissue.young_kpa * strain, rtol=1e-10)
     expected = np.eye(3) - strain * np.outer(turn[:, 2], turn[:, 2])
-    assert_allclose(deformation_gradient(pair.mesh, u), np.broadcast_to(expected, (len(pair.mesh.tets), 3, 3)), atol=1e-12)
+    assert_allclose(
+        deformation_gradient(pair.mesh, u), np.broadcast_to(expected, (len(pair.mesh.tets), 3, 3)), atol=1e-12
+    )
     assert_allclose(state.between.gap, 0, atol=1e-11)
 
 
@@ -184,7 +186,7 @@ def test_weight_passes_from_a_block_through_another_one_to_the_floor() -> None:
     tissue, density = Tissue(poisson=0.0), 30.0
     lower, upper = box((3, 3, 3), (30.0, 30.0, 30.0)), box((4, 4, 2), (30.0, 30.0, 20.0))
     height = np.concatenate([lower.points[:, 2], upper.points[:, 2] + 30.0])
-    pair = Pair.of(lower, TetMesh(upper.points + [0, 0, 30.0], upper.tets), (height == 0) | (height == 30))
+    pair = Pair.of(lower, TetMesh(upper.points + 30.0 * np.eye(3)[2], upper.tets), (height == 0) | (height == 30))
     count, size = len(pair.nodes), pair.mesh.points.size
     weight = density * GRAVITY_KPA_PER_MM * 30.0**2 * np.array([30.0, 20.0])
     spring = weight.sum() / len(height) / 5.0  # at every node, by which the blocks alone would sink by some 5 mm

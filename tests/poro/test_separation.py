@@ -27,8 +27,9 @@ def halves(edge_mm: float = EDGE_MM, joined_mm: float = 0.0) -> Pieces:
     affine[:3, 3] = -40.0
     ijk = np.stack(np.meshgrid(*[np.arange(41)] * 3, indexing="ij"), axis=-1)
     inside = np.linalg.norm(ijk * 2.0 - 40.0, axis=-1) < RADIUS_MM
+    joint = np.array([-20.0, 0, 0])
     return stuff_pieces(
-        inside, affine, edge_mm, lambda x: x[:, 2], lambda x: np.linalg.norm(x + [20.0, 0, 0], axis=1) < joined_mm
+        inside, affine, edge_mm, lambda x: x[:, 2], lambda x: np.linalg.norm(x - joint, axis=1) < joined_mm
     )
 
 

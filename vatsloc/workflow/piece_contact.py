@@ -19,6 +19,9 @@ CONTACT = "contact between pieces"
 KEYPOINT_SIGMA_MM = 1.5
 """How well keypoints are where the registered pieces have them."""
 
+MOST_LEFT = 0.5
+"""Of the overlap; where more is left, contact has not settled."""
+
 
 def held_apart(collapse: Collapse, settings: Settings, stages: Stages) -> Collapse:
     """The collapse after its pieces were pressed apart; what was given for one piece, or where they hardly overlap."""
@@ -31,7 +34,13 @@ def held_apart(collapse: Collapse, settings: Settings, stages: Stages) -> Collap
         return collapse
     with stages.stage(CONTACT):
         found = pressed_apart(collapse)
-        return replace(collapse, points_after=collapse.points_after + found.u)
+    if found.after_mm3 > MOST_LEFT * found.before_mm3:
+        left = f"{found.after_mm3 / 1e3:.2f} of {found.before_mm3 / 1e3:.2f} ml"
+        stages.warn(
+            f"The pieces of the lung overlap and could not be pressed apart ({left} left); they stay as they are."
+        )
+        return collapse
+    return replace(collapse, points_after=collapse.points_after + found.u)
 
 
 def overlap_mm3(pieces: Pieces, points: Array) -> float:
