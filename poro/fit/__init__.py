@@ -1,8 +1,7 @@
 """Fit of the collapse to the visible surface and to points matched inside the lung, and what it is worth.
 
 `fit_collapse` finds the parameters that bring the lung to a `Target`; `point_covariance` and `ellipsoid95` say how sure
-places are, `identifiability` how well each parameter is held; `elastic_correction` takes what the parameters leave,
-`hold_apart` presses pieces apart that overlap.
+places are, `identifiability` how well each parameter is held; `elastic_correction` takes what the parameters leave.
 """
 
 from poro.fit.collapse_fit import Fit, FitStatus, fit_collapse
@@ -11,23 +10,18 @@ from poro.fit.elastic_correction import PointConstraints, constraints_to, elasti
 from poro.fit.identifiability import Identifiability, identifiability
 from poro.fit.observations import Target
 from poro.fit.problem import FitSettings
-from poro.fit.separation import Held, Separation, facing_pieces, hold_apart
 
 __all__ = [
     "Fit",
     "FitSettings",
     "FitStatus",
-    "Held",
     "Identifiability",
     "PointConstraints",
-    "Separation",
     "Target",
     "constraints_to",
     "elastic_correction",
     "ellipsoid95",
-    "facing_pieces",
     "fit_collapse",
-    "hold_apart",
     "identifiability",
     "point_covariance",
 ]

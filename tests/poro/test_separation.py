@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from poro import separation
 from poro.arrays import Array
 from poro.contact import ContactStatus, LevelSet
 from poro.fem import Tissue
-from poro.fit import Held, facing_pieces, hold_apart, separation
 from poro.mesh import closest_points, interpolate, locate
 from poro.mesh.pieces import Pieces, stuff_pieces
+from poro.separation import Held, facing_pieces, hold_apart
 
 RADIUS_MM, EDGE_MM, JOINED_MM = 30.0, 6.0, 10.0
 OPEN = LevelSet(np.full((4, 4, 4), 1e3), np.zeros(3), 1e3)

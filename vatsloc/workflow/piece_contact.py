@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from poro.fem import Tissue
-from poro.fit import Held, Separation, facing_pieces, hold_apart
 from poro.mesh.pieces import Pieces
+from poro.separation import Held, Separation, facing_pieces, hold_apart
 from registration.volume import Array
 from vatsloc.workflow.choices import weigh
 from vatsloc.workflow.pneumothorax import Collapse
