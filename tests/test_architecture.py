@@ -36,6 +36,7 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         "contact": {"arrays", "errors", "linalg", "mesh"},
         "collapse": {"arrays", "errors", "contact", "fem", "linalg", "mesh"},
         "fit": {"arrays", "collapse", "fem", "mesh"},
+        "separation": {"arrays", "contact", "fem", "fit", "linalg", "mesh"},
         "breathing": {"arrays", "errors", "contact", "fem", "linalg", "mesh"},
     },
     "vatsloc": {

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
+from scipy.sparse import csr_matrix
 
 from poro.arrays import Array
 from poro.contact.compliance import Compliance, Groups
@@ -45,6 +46,13 @@ class GeometricStiffness:
     def coupling(self, nodes: Array, normal: Array) -> Array:
         """Motion (k, r) of nodes (k,) along normal (k, 3) under a unit force of every term."""
         return _coupling(self.groups.motion, nodes, normal, self.directions)
+
+    def coupling_of(self, gradients: csr_matrix) -> Array:
+        """Motion (k, r) along gradients (k, 3 nc), each of several nodes, under a unit force of every term."""
+        group, unit = self.directions
+        motion = self.groups.motion
+        moved = np.asarray(gradients @ motion.reshape(len(motion) * 3, -1)).reshape(gradients.shape[0], -1, 3)
+        return np.asarray(np.einsum("krb,rb->kr", moved[:, group], unit))
 
     def displacements(self, force: Array) -> Array:
         """Displacements (nc, 3) under the terms' forces (r,)."""

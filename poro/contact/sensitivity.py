@@ -20,7 +20,10 @@ def contact_sensitivity(
 
     free: (nc, 3, k) derivatives of the displacements without wall; travel: (k,) derivatives of the wall's travel. The
     wall's curvature turns the forces as the nodes slide; normal and turning forces come from one symmetric system.
+    Raises ValueError for contact between pieces, whose derivatives are not known.
     """
+    if state.between is not None:
+        raise ValueError("derivatives of contact are known for one piece in front of a wall, not for two that touch")
     active = np.flatnonzero(state.active)
     sliding, along, values = _nodal_stiffness(np.where(state.active, state.force, 0), state.hessian)
     rows = np.concatenate([active, sliding])

@@ -100,20 +100,31 @@ def elastic_correction(
     operator = interpolation_matrix(where, len(u))
     axial = np.linalg.norm(wanted.normals, axis=1) > 0.5
     shape = np.where(axial[:, None, None], wanted.normals[:, :, None] * wanted.normals[:, None, :], np.eye(3))
-    # What holds the body where no constraint does; far below any tissue stiffness.
-    anchor = diags(np.repeat(1e-6 * tissue.young_kpa * np.cbrt(mesh.node_volumes), 3)).tocsr()
+    anchored = diags(anchor(mesh, tissue)).tocsr()
     influence = _near(where)
     field = np.zeros_like(u)
     for number in range(rounds):
-        unit = tissue.young_kpa * REGION_MM3 * (model_sigma / 2.0 ** (rounds - 1 - number)) ** 2
+        unit = energy_per_datum(tissue, model_sigma / 2.0 ** (rounds - 1 - number))
         penalty = (unit * influence / wanted.sigma_mm**2)[:, None, None] * shape
         matrix, force = point_constraints(operator, penalty, wanted.offset)
-        field = constrained(mesh, tissue, (matrix + anchor).tocsr(), force)
+        field = constrained(mesh, tissue, (matrix + anchored).tocsr(), force)
         misfit = np.linalg.norm(np.einsum("qij,qj->qi", shape, wanted.offset - operator @ field), axis=1)
         scale = robust * np.maximum(wanted.sigma_mm, 1.4826 * np.median(misfit[influence > 0]))
         influence = _near(where) / (1 + (misfit / scale) ** 2)
     det_f = np.linalg.det(deformation_gradient(mesh, u + field))
     return ElasticCorrection(field, det_f, influence)
+
+
+def energy_per_datum(tissue: Tissue, model_sigma: float) -> float:
+    """Energy, kPa mm3, of a strain of `model_sigma` in a tenth of a litre: what one standard deviation of a datum is
+    worth, squared and halved.
+    """
+    return tissue.young_kpa * REGION_MM3 * model_sigma**2
+
+
+def anchor(mesh: TetMesh, tissue: Tissue) -> Array:
+    """Stiffness (3n,) kPa mm that holds a body where no constraint does; far below any tissue stiffness."""
+    return np.repeat(1e-6 * tissue.young_kpa * np.cbrt(mesh.node_volumes), 3)
 
 
 def _near(where: Location) -> Array:

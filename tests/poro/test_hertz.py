@@ -6,14 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from hertz import half_block, half_space
 from numpy.testing import assert_allclose
-from scipy.optimize import brentq
-from shapes import box, compliance_of, order
+from shapes import compliance_of, order
 
 from poro.arrays import Array
 from poro.contact import ChestWall, ContactState, ContactStatus, LevelSet, solve_contact
 from poro.fem import Tissue, solid
-from poro.mesh import TetMesh
 
 TISSUE = Tissue()
 RADIUS, CONTACT = 400.0, 8.0  # mm; the wall's slope at the contact's edge is 1 : 50
@@ -21,44 +20,6 @@ MODULUS = TISSUE.young_kpa / (1 - TISSUE.poisson**2)
 DEPTH = CONTACT**2 / RADIUS
 FORCE = 4 / 3 * MODULUS * np.sqrt(RADIUS) * DEPTH**1.5
 PEAK = 2 * MODULUS * CONTACT / (np.pi * RADIUS)
-
-
-def _graded(cells: int, far: float, finest: float) -> Array:
-    """Coordinates 0..far whose steps grow in a constant ratio from `finest`."""
-    ratio = brentq(lambda r: finest * (r**cells - 1) / (r - 1) - far, 1.0001, 10)
-    return finest * (ratio ** np.arange(cells + 1) - 1) / (ratio - 1)
-
-
-def _block(cells: int, finest: float) -> TetMesh:
-    """Half-space z <= 0 cut off 4 contact radii from the middle, fine under the contact."""
-    side = _graded(cells, 4 * CONTACT, finest)
-    across = np.concatenate([-side[:0:-1], side])
-    unit = box((2 * cells, 2 * cells, cells), (2 * cells, 2 * cells, cells))
-    index = np.rint(unit.points).astype(int)
-    points = np.stack([across[index[:, 0]], across[index[:, 1]], -side[::-1][index[:, 2]]], axis=1)
-    return TetMesh(points, unit.tets)
-
-
-def _half_space(points: Array) -> Array:
-    """Displacement (n, 3) under Hertz's pressure: Boussinesq's point force, integrated over the contact.
-
-    Ref: Johnson 1985, eqs. 3.19 and 3.39.
-    """
-    x, w = np.polynomial.legendre.leggauss(8)
-    r, wr = (x + 1) / 2, w / 2
-    angle = 2 * np.pi * np.arange(24) / 24
-    u = np.zeros_like(points)
-    for s, ws in zip(r, wr, strict=True):
-        # r = a sqrt(1 - s^2) turns the pressure p0 s into a polynomial.
-        rho = CONTACT * np.sqrt(1 - s**2)
-        load = PEAK * s * CONTACT**2 * s * ws * 2 * np.pi / len(angle)
-        for t in angle:
-            d = points - [rho * np.cos(t), rho * np.sin(t), 0]
-            far, z, nu = np.linalg.norm(d, axis=1), -d[:, 2], TISSUE.poisson
-            unit = (1 + nu) * load / (2 * np.pi * TISSUE.young_kpa)
-            u[:, :2] += (unit * (z / far**3 - (1 - 2 * nu) / (far * (far + z))))[:, None] * d[:, :2]
-            u[:, 2] -= unit * (z**2 / far**3 + 2 * (1 - nu) / far)
-    return u
 
 
 def _paraboloid(step: float = 8.0) -> LevelSet:
@@ -80,7 +41,7 @@ class Indent:
 
 
 def _indent(cells: int, finest: float) -> Indent:
-    mesh = _block(cells, finest)
+    mesh = half_block(cells, finest, CONTACT)
     boundary = mesh.boundary
     x, y, z = mesh.points.T
     far = 4 * CONTACT * (1 - 1e-9)
@@ -88,7 +49,7 @@ def _indent(cells: int, finest: float) -> Indent:
     top = np.setdiff1d(np.flatnonzero(z == 0), held)
     nodes = top[np.hypot(x[top], y[top]) < 1.5 * CONTACT]
     body = solid(mesh, TISSUE, held)
-    free = body.solve(np.zeros_like(mesh.points), _half_space(mesh.points[held]))
+    free = body.solve(np.zeros_like(mesh.points), half_space(mesh.points[held], CONTACT, PEAK, TISSUE))
     still = np.zeros(len(nodes), bool)
     wall = ChestWall(_paraboloid(), mesh.points[nodes], still, np.array([0, 0, 1.0]), np.zeros(len(nodes)))
     state = solve_contact(compliance_of(body, nodes), wall, free[nodes], 0.0)
@@ -107,7 +68,7 @@ def test_half_space_sinks_by_hertz_inside_and_outside_the_contact() -> None:
     below = np.array([[3 * CONTACT, 0, -1e-6], [0, 3 * CONTACT, -1e-6]])
     r, a = 3 * CONTACT, CONTACT
     exact = PEAK / (4 * MODULUS * a) * ((4 * a**2 - 2 * r**2) * np.arcsin(a / r) + 2 * r * np.sqrt(r**2 - a**2) * a / r)
-    assert_allclose(_half_space(below)[:, 2], -exact, rtol=1e-4)
+    assert_allclose(half_space(below, CONTACT, PEAK, TISSUE)[:, 2], -exact, rtol=1e-4)
 
 
 def test_force_radius_and_pressure_converge_to_hertz(indents: list[Indent]) -> None:

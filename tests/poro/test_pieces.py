@@ -100,3 +100,37 @@ def test_a_part_holds_the_tetrahedra_of_its_piece() -> None:
 def test_a_sheet_beside_the_ball_leaves_nothing_for_one_piece() -> None:
     with pytest.raises(ValueError, match="no element"):
         stuff_pieces(*_ball(), EDGE_MM, lambda x: x[:, 2] - 60.0, lambda x: np.zeros(len(x), bool))
+
+
+def test_an_incomplete_fissure_leaves_the_fused_part_whole() -> None:
+    """Grown together on one side of a line: shared nodes there, two nodes at every place of the cut elsewhere."""
+    pieces = stuff_pieces(*_ball(), EDGE_MM, _side, lambda x: x[:, 0] > 0)
+    first, second = (pieces.part(number)[1] for number in (0, 1))
+    shared = np.intersect1d(first, second)
+    assert len(shared) > 20
+    assert (pieces.mesh.points[shared, 0] > 0).all()
+    assert (pieces.mesh.points[pieces.pairs[:, 0], 0] <= 0).all()
+    assert_allclose(pieces.mesh.points[shared] @ NORMAL / np.linalg.norm(NORMAL), 4.0, atol=1e-6)
+    complete = _cut(0.0)
+    assert len(shared) + len(pieces.pairs) == len(complete.pairs)
+    assert _bodies(pieces) == 1
+    boundary = pieces.mesh.boundary
+    faces = boundary.points[boundary.triangles]
+    fused = (np.abs(_side(faces.reshape(-1, 3))).reshape(-1, 3).max(axis=1) < 1e-6) & (faces[:, :, 0].min(axis=1) > 0)
+    # No crack in the midst of it: only a groove along its rim, where either side's lattice rounds a sharp edge.
+    assert np.linalg.norm(faces[fused], axis=2).max(axis=1).min() > RADIUS_MM - 1.5 * EDGE_MM
+
+
+def _bowed(points: np.ndarray) -> np.ndarray:
+    return points[:, 2] + 0.9 * points[:, 1] - 6 + 8 * (points[:, 0] / 30) ** 2
+
+
+@pytest.mark.parametrize("edge_mm", [4.0, 6.0, 8.0])
+def test_a_bowed_cut_has_no_slivers_at_any_size_of_element(edge_mm: float) -> None:
+    pieces = stuff_pieces(*_ball(), edge_mm, _bowed, lambda x: x[:, 0] > 10)
+    told = quality(pieces.mesh)
+    assert told.min_dihedral > 12
+    assert told.max_dihedral < 160
+    assert told.min_edge > 0.25 * edge_mm
+    assert pieces.mesh.volumes.min() > 1e-3 * edge_mm**3
+    assert set(np.unique(pieces.piece)) == {0, 1}

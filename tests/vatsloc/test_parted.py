@@ -9,17 +9,19 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from poro.mesh import TetMesh
+from poro.mesh import TetMesh, quality, stuff
 from registration.correspondences import Correspondences
 from registration.volume import Array, Mask
 from tests.vatsloc import run_scene as known
 from vatsloc.workflow import parted as module
 from vatsloc.workflow.fissures import Fissure, Parted, Sheet
-from vatsloc.workflow.parted import _carried, _on_pieces, _with_residual, cut_lung
+from vatsloc.workflow.model_selection import Refinement
+from vatsloc.workflow.parted import JOINED_MM, _carried, _on_pieces, _with_residual, cut_lung, in_pieces
 from vatsloc.workflow.pneumothorax import Collapse
 from vatsloc.workflow.pose import ChangeOfPose
 from vatsloc.workflow.residual import Residual
 from vatsloc.workflow.settings import Settings
+from vatsloc.workflow.stages import Stages
 
 FLAT = Fissure(Sheet(known.CENTRE, np.zeros(6)), 0.5, 100, 0.9, 200)  # z of the lung's centre
 BEFORE_FROM_CT = known.as_affine(known.DEF_FROM_INF_RIGID) @ known.INF_FROM_CT
@@ -191,3 +193,75 @@ def test_a_motion_of_coarse_pieces_is_carried_to_fine_ones_without_crossing_the_
         mine = (fine.node_piece() == number) & (clear | far)
         assert mine.sum() > 10
         assert_allclose(carried[mine], np.broadcast_to(apart[number], (mine.sum(), 3)), atol=1e-9)
+
+
+BOWED = replace(FLAT, sheet=Sheet(known.CENTRE - [28.0, 0, 0], np.array([0.9, 0.1, 3.0, 4.0, -3.0, 2.0])))
+
+
+def test_a_cut_lung_is_one_about_its_hilum_and_two_beyond_and_has_no_slivers() -> None:
+    prepared = known.scene().prepared
+    pieces = cut_lung(prepared, BOWED, 6.0)
+    whole = stuff(prepared.lung_ct.inside, prepared.lung_ct.ras_from_ijk, 6.0)
+    first, second = (pieces.part(number)[1] for number in (0, 1))
+    shared, far = np.intersect1d(first, second), pieces.pairs[:, 0]
+    hilum, points = BOWED.sheet.hilum, pieces.mesh.points
+    assert len(shared) > 3
+    assert (np.linalg.norm(points[shared] - hilum, axis=1) < JOINED_MM).all()
+    assert (np.linalg.norm(points[far] - hilum, axis=1) >= JOINED_MM).all()
+    assert_allclose(BOWED.sheet.distance(points[far]), 0, atol=0.2)
+    assert 0.9 < pieces.mesh.volumes.sum() / whole.volumes.sum() < 1
+    assert quality(pieces.mesh).min_dihedral > 12
+    for number, sign in ((0, 1), (1, -1)):
+        part, _ = pieces.part(number)
+        assert (sign * BOWED.sheet.distance(part.points) > -0.5).all()
+
+
+def in_one_piece(
+    monkeypatch: pytest.MonkeyPatch, fissure: Fissure | None, kept: bool = True
+) -> tuple[ChangeOfPose, Collapse, Stages]:
+    """What `in_pieces` leaves of the known run, in which such a sheet was seen."""
+    scene = known.scene().with_model(refinements=(Refinement("regional fit", 3.0, 2.0, kept),))
+    monkeypatch.setattr(module, "seen_fissure", lambda _pose, _collapse: fissure)
+    stages = Stages()
+    return *in_pieces(scene.prepared, scene.pose, scene.collapse, Settings(), stages), stages
+
+
+@pytest.mark.parametrize(
+    ("fissure", "why"),
+    [
+        (None, "too few keypoints to tell pieces apart"),
+        (replace(FLAT, cost_share=0.9), "two smooth maps cost 0.90 of one at keypoints"),
+        (replace(FLAT, gas=10), "of 10 points of gas lie along a sheet"),
+        (replace(FLAT, gas_share=0.3), "30 % of 100 points of gas"),
+    ],
+)
+def test_a_lung_without_fissures_stays_in_one_piece(
+    monkeypatch: pytest.MonkeyPatch, fissure: Fissure | None, why: str
+) -> None:
+    pose, collapse, stages = in_one_piece(monkeypatch, fissure)
+    assert pose is known.scene().pose
+    assert collapse.parted is None
+    assert collapse.fissure is fissure
+    assert_array_equal(collapse.points_after, known.scene().collapse.points_after)
+    assert why in stages.skipped[module.PIECES]
+
+
+def test_where_the_model_follows_no_keypoints_no_fissure_is_looked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    _, collapse, stages = in_one_piece(monkeypatch, FLAT, kept=False)
+    assert collapse.parted is None
+    assert collapse.fissure is None
+    assert stages.skipped[module.PIECES] == "no refinement of the model was kept"
+
+
+def test_a_cut_that_predicts_no_better_is_not_made(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "_fitted", lambda *_: None)
+    _, collapse, stages = in_one_piece(monkeypatch, FLAT)
+    assert collapse.parted is None
+    assert collapse.fissure is FLAT
+    assert "not predicted better" in stages.skipped[module.PIECES]
+
+
+def test_a_piece_too_thin_for_an_element_is_not_cut_off() -> None:
+    beside = replace(FLAT, sheet=Sheet(known.CENTRE, np.array([0, 0, known.RADIUS_MM + 5, 0, 0, 0])))
+    with pytest.raises(ValueError, match="no element"):
+        cut_lung(known.scene().prepared, beside, 8.0)

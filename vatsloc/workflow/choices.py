@@ -21,7 +21,7 @@ class Choice:
         return asdict(self)
 
 
-def weigh(part: str, value: float, limit: float, seen: str) -> Choice:
-    """Leave `part` out where value <= limit, mm; what was not measured (NaN) keeps it. seen: the value in words."""
-    rule = "kept in every case" if limit < 0 else f"left out up to {limit:g} mm"
+def weigh(part: str, value: float, limit: float, seen: str, unit: str = "mm") -> Choice:
+    """Leave `part` out where value <= limit; what was not measured (NaN) keeps it. seen: the value in words."""
+    rule = "kept in every case" if limit < 0 else f"left out up to {limit:g} {unit}"
     return Choice(part, not value <= limit, f"{seen}; {rule}", float(value), float(limit))

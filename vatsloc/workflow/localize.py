@@ -3,7 +3,8 @@
 `before_collapse` does what needs no deflated scan: it reads lungs, airways and spines off the CT and the inflated
 cone-beam CT, and finds the change of pose between them, phase 1. Without an inflated scan `stand_in` expects both from
 the CT. `prepare` reads off the deflated scan. `pneumothorax` is phase 2, from the inflated to the deflated lung;
-`in_pieces` cuts a lung whose lobes came apart; `refined` makes it follow small blocks of the CT up to the pleura.
+`in_pieces` cuts a lung whose lobes came apart; `refined` makes it follow small blocks of the CT up to the pleura;
+`held_apart` presses pieces apart that these registrations, each for itself, have let overlap.
 `locate_nodule` carries the nodule through both and says how uncertain it is. `checked` compares the result with the
 scans by keypoints that nothing before it has used.
 """
@@ -14,6 +15,7 @@ from vatsloc.case import Case
 from vatsloc.workflow.localization import Localization, checked, locate_nodule
 from vatsloc.workflow.observe import spine_from_ct
 from vatsloc.workflow.parted import in_pieces
+from vatsloc.workflow.piece_contact import held_apart
 from vatsloc.workflow.pneumothorax import pneumothorax, refined
 from vatsloc.workflow.prepare import prepare
 from vatsloc.workflow.settings import Settings
@@ -34,5 +36,6 @@ def localize(case: Case, settings: Settings, stages: Stages, state: State | None
     collapse = pneumothorax(case, prepared, pose, settings, stages, spine)
     pose, collapse = in_pieces(prepared, pose, collapse, settings, stages)
     collapse = refined(case, prepared, pose, collapse, settings, stages)
+    collapse = held_apart(collapse, settings, stages)
     found = locate_nodule(case, prepared, pose, collapse, settings, stages)
     return checked(case, found, settings, stages, known.left_over)

@@ -93,12 +93,14 @@ class LeaveOutSettings(_Table):
 
     first_registration_mm: how far 95 % of the keypoints inside the lung moved against the spine; residual_mm: median
     misfit of the model at held-out keypoints; strained_share: of elements beyond the range of linear strain
-    (finite strain). -1 keeps a part whatever is seen.
+    (finite strain); overlap_ml: volume that two pieces share (contact between pieces). -1 keeps a part whatever is
+    seen.
     """
 
     first_registration_mm: float = Field(default=-1.0, ge=-1)
     residual_mm: float = Field(default=-1.0, ge=-1)
     strained_share: float = Field(default=0.001, ge=-1)
+    overlap_ml: float = Field(default=5.0, ge=-1)
 
 
 class OutputSettings(_Table):
