@@ -15,6 +15,7 @@ from tests.faults import copies
 from tests.faults.imports import Imports
 from tests.faults.mutants import OPERATORS, Mutant, mutants, sibling_fields
 from tests.faults.table import Record, table
+from tests.faults.warm import Suite
 
 CHANGES = [
     ("comparison", "a < b", ["a <= b", "a > b"]),
@@ -98,6 +99,85 @@ def after(operator: str, text: str) -> list[str]:
     return [mutant.plant(text) for mutant in found if mutant.operator == operator]
 
 
+KEPT = """from dataclasses import dataclass
+from functools import cached_property, lru_cache
+
+
+def deep():
+    return 1
+
+
+@lru_cache
+def kept():
+    return deep()
+
+
+@dataclass(frozen=True)
+class Pair:
+    a: int
+
+    @cached_property
+    def twice(self):
+        return double(self.a)
+
+    def thrice(self):
+        return triple(
+            self.a
+        )
+
+
+def double(a):
+    return 2 * a
+
+
+def triple(a): return [a * three for three in [3]][0]
+
+
+def unused():
+    return 0
+
+
+@njit(cache=True)
+def kernel():
+    return 0
+
+
+AT_ONCE = triple(2)
+"""
+TEST_KEPT = """import subprocess, sys, threading
+
+import pytest
+
+from kept import Pair, deep, double, kept, triple
+
+
+@pytest.fixture(scope="module")
+def pair():
+    double(1)
+    return Pair(2)
+
+
+def test_first(pair): assert kept() == 1
+
+
+def test_second(pair): assert pair.twice == 4
+
+
+def test_third(): assert Pair(1).thrice() == 3
+
+
+def test_in_a_thread():
+    found = []
+    thread = threading.Thread(target=lambda: found.append(deep()))
+    thread.start()
+    thread.join()
+    assert found == [1]
+
+
+def test_elsewhere(): subprocess.run([sys.executable, "-c", ""], check=True)
+"""
+
+
 @pytest.fixture
 def tree(tmp_path: Path) -> Path:
     """A small project: the test lets the limit of `adult` and all of `first` go, the demo lets only `first` go."""
@@ -164,7 +244,7 @@ def test_scope_names_files_that_are_there(tree: Path) -> None:
         mutation.in_scope(tree, {"ages.py": (), "gone.py": ()})
 
 
-def test_tests_are_found_by_their_imports_nearest_and_fastest_first(tmp_path: Path) -> None:
+def test_tests_are_found_by_their_imports_nearest_and_narrowest_first(tmp_path: Path) -> None:
     for file, text in {
         "pack/__init__.py": "from pack.inner import f",
         "pack/inner.py": "from far import g\ndef f(): return g()",
@@ -183,9 +263,10 @@ def test_tests_are_found_by_their_imports_nearest_and_fastest_first(tmp_path: Pa
     assert mutation.within_reach(imports, "pack/inner.py") == {near: 1, scene: 2}
     assert mutation.within_reach(imports, "far.py") == {near: 2}
     assert mutation.within_reach(imports, "farther.py") == {near: 3}
-    assert mutation.first_in_turn({"a": 2, "b": 1, "c": 1}, {"a": 1, "b": 9, "c": 2}) == ["c", "b", "a"]
-    many = {str(step): step for step in range(20)}
-    assert mutation.first_in_turn(many, dict.fromkeys(many, 1.0)) == list(many)[: mutation.MOST]
+    steps = {scene: 1, "tests/test_other.py": 1, near: 1, "pack/inner.py": 2, "far.py": 1}
+    expected = ["far.py", "tests/test_other.py", near, scene, "pack/inner.py"]  # those of a step by what they reach
+    assert mutation.first_in_turn(imports, steps) == expected
+    assert mutation.first_in_turn(imports, dict.fromkeys(imports.trees, 1))[:1] == ["alone.py"]
 
 
 def test_kernels_are_stale_with_what_they_hold(tmp_path: Path) -> None:
@@ -219,11 +300,56 @@ def test_a_planted_fault_goes_and_what_was_compiled_comes_back(tree: Path) -> No
     }
 
 
+def test_tests_are_told_by_the_functions_that_they_enter(tree: Path) -> None:
+    (tree / "kept.py").write_text(KEPT.replace("@njit(cache=True)\n", ""))
+    (tree / "tests" / "test_kept.py").write_text(TEST_KEPT)
+    imports = Imports(tree)
+    with Suite(tree) as suite:
+        told = copies.baseline(suite, "tests/test_kept.py")
+
+    def entering(name: str) -> list[str]:
+        line = 1 + next(n for n, text in enumerate(KEPT.splitlines()) if text.strip().startswith(f"def {name}("))
+        found = copies.entering(told, imports.function("kept.py", line + ("return" not in KEPT.splitlines()[line - 1])))
+        return [test.split("::test_")[1] for test, _ in found]
+
+    everything = ["first", "second", "third", "in_a_thread", "elsewhere"]
+    assert entering("unused") == ["elsewhere"]
+    assert entering("thrice") == ["third", "elsewhere"]
+    assert entering("double") == everything, "of a property that is kept"
+    assert entering("deep") == everything, "of a function whose result is kept"
+    assert entering("triple") == everything, "when the module is imported"
+
+
+def test_a_fixture_s_functions_are_entered_by_all_that_ask_for_it(tree: Path) -> None:
+    (tree / "tests" / "test_fixture.py").write_text(
+        "import pytest\nfrom ages import first\n\n@pytest.fixture(scope='module')\ndef one(): return first([1])\n\n"
+        "@pytest.fixture\ndef two(one): return 2 * one\n\ndef test_a(one): pass\ndef test_b(): pass\n"
+        "def test_c(two): pass\n"
+    )
+    with Suite(tree) as suite:
+        told = copies.baseline(suite, "tests/test_fixture.py")
+        line = Imports(tree).function("ages.py", 6)
+        only = [name for name, _ in copies.entering(told, line)]
+        assert only == ["tests/test_fixture.py::test_a", "tests/test_fixture.py::test_c"]
+        assert "2 passed" in suite.run(["tests/test_fixture.py"], only=only)[1]
+
+
+def test_functions_are_found_by_their_lines(tmp_path: Path) -> None:
+    (tmp_path / "kept.py").write_text(KEPT)
+    imports = Imports(tmp_path)
+    at = {text.strip(): number for number, text in enumerate(KEPT.splitlines(), 1)}
+    assert imports.function("kept.py", at["return deep()"]) == f"kept.py:{at['@lru_cache']}"
+    assert imports.function("kept.py", at["self.a"]) == f"kept.py:{at['def thrice(self):']}"
+    assert imports.function("kept.py", at["a: int"]) is None
+    assert imports.function("kept.py", at["AT_ONCE = triple(2)"]) is None
+    assert imports.function("kept.py", at["@njit(cache=True)"] + 2) is None
+
+
 def test_verdicts_are_right_and_are_taken_up_again(tree: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
 
     def run(*words: str) -> list[Record]:
-        command = ["--out", str(out), "--only", "*.py", "--seed", "3", *words]
+        command = ["--out", str(out), "--only", "*.py", "--seed", "3", "--warm", "", *words]
         mutation.main(command, tree, {"ages.py": (), "tests/*.py": None})
         return [json.loads(line) for line in (out / "mutants.jsonl").read_text().splitlines()]
 
@@ -246,8 +372,9 @@ def test_a_mutant_that_hangs_is_ended_in_time(tree: Path, monkeypatch: pytest.Mo
     (tree / "ages.py").write_text(text)
     (mutant,) = (mutant for mutant in mutants("ages.py", text) if mutant.after == ">" and mutant.before == "<")
     start = time.monotonic()
-    assert copies.judge(tree, mutant, ["ages.py"], ["tests/test_ages.py"], 0.0)["verdict"] == "timeout"
-    assert time.monotonic() - start < 20
+    with Suite(tree) as suite:
+        assert copies.judge(suite, mutant, ["ages.py"], ["tests/test_ages.py"], 0.0)["verdict"] == "timeout"
+    assert time.monotonic() - start < 60
 
 
 def test_tests_that_fail_without_a_fault_end_the_run_unless_left_out(tree: Path, tmp_path: Path) -> None:
@@ -255,7 +382,7 @@ def test_tests_that_fail_without_a_fault_end_the_run_unless_left_out(tree: Path,
     (tree / "tests" / "test_first.py").write_text(
         "from ages import first\n\n\ndef test_first(): assert first([1]) == 1\n"
     )
-    words = ["--out", str(tmp_path), "--number", "1"]
+    words = ["--out", str(tmp_path), "--number", "1", "--warm", ""]
     with pytest.raises(SystemExit, match="mend them first"):
         mutation.main(words, tree, {"ages.py": ()})
     mutation.main([*words, "--deselect", "tests/test_ages.py::test_adult"], tree, {"ages.py": ()})
@@ -265,7 +392,8 @@ def test_tests_that_fail_without_a_fault_end_the_run_unless_left_out(tree: Path,
 
 def test_what_does_not_compile_is_no_kill(tree: Path) -> None:
     mutant = Mutant("ages.py", 1, 0, "truth", "def", "(", "def adult(age):", 0, 3)
-    verdict = copies.judge(tree, mutant, ["ages.py"], ["tests/test_ages.py"], 1.0)
+    with Suite(tree) as suite:
+        verdict = copies.judge(suite, mutant, ["ages.py"], ["tests/test_ages.py"], 1.0)
     assert verdict["verdict"] == "does not compile"
 
 
