@@ -98,6 +98,23 @@ def test_distances_are_to_the_surface_and_with_plain_to_its_nearest_node(system:
     assert_allclose(np.linalg.norm(plain, axis=1), nearest)
 
 
+@pytest.mark.parametrize(("degrees", "share"), [(0.0, 1.0), (60.0, 0.5), (90.0, 0.0), (150.0, 0.0)])
+def test_a_target_point_whose_normal_disagrees_loses_weight_and_an_opposed_one_all(
+    system: PoroSystem, degrees: float, share: float
+) -> None:
+    """Above the surface's nodes, which are nearest, by their normals turned about the tangent nearest to A."""
+    boundary, still = system.mesh.boundary, np.zeros_like(system.mesh.points)
+    up = boundary.node_normals
+    across = np.cross(up, [0.0, 1.0, 0.0])
+    across /= np.linalg.norm(across, axis=1)[:, None]
+    turn = np.deg2rad(degrees)
+    confidence = np.linspace(0.2, 1.0, len(up))
+    target = Target(boundary.points + up, np.cos(turn) * up + np.sin(turn) * across, confidence)
+    rows = Observer(system.mesh, target).residuals(still)
+    assert_allclose(rows.value, 1.0, atol=1e-9)
+    assert_allclose(rows.weight, share * confidence, atol=1e-9)
+
+
 def test_weights_do_not_hang_on_rounding(system: PoroSystem, truth: PoroState) -> None:
     """Points outside a bulging surface lie nearest to its edges and corners, which belong to several faces."""
     observer = Observer(system.mesh, _target(system, solve(system, Theta(1e-9, 0.85))))
