@@ -6,6 +6,7 @@ number and its exit status on stdout.
 
 from __future__ import annotations
 
+import gc
 import importlib
 import json
 import os
@@ -20,7 +21,7 @@ import threading
 import time
 import traceback
 from collections import defaultdict
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from types import CodeType, FrameType
@@ -87,6 +88,8 @@ class Reach:
 
     @pytest.hookimpl(wrapper=True)
     def pytest_collection(self) -> Iterator[None]:
+        if "numba" in sys.modules:
+            _while_compiling(lambda: sys.settrace(None), lambda: sys.settrace(self._enter))
         threading.settrace(self._enter)
         sys.settrace(self._enter)
         said = yield
@@ -131,6 +134,25 @@ class Reach:
             "always": sorted(map(name, self.always)),
             "reach": reach,
         }
+
+
+def _while_compiling(begin: Callable[[], None], end: Callable[[], None]) -> None:
+    """Calls when numba begins and ends to compile: watched, it would take five times as long."""
+    from numba.core import event
+
+    class Listener(event.Listener):  # type: ignore[misc]
+        depth = 0
+
+        def on_start(self, _: object) -> None:
+            self.depth += 1
+            begin()
+
+        def on_end(self, _: object) -> None:
+            self.depth -= 1
+            if not self.depth:
+                end()
+
+    event.register("numba:compile", Listener())
 
 
 class Only:
@@ -240,4 +262,5 @@ if __name__ == "__main__":
             importlib.import_module(module)
         except ImportError:
             continue
+    gc.freeze()  # so that forks leave alone what they share
     serve(sys.stdin, partial(print, flush=True))
