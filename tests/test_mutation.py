@@ -390,6 +390,15 @@ def test_tests_that_fail_without_a_fault_end_the_run_unless_left_out(tree: Path,
     assert (record["operator"], record["verdict"]) == ("comparison", "survived")
 
 
+def test_a_fault_that_no_conftest_can_be_imported_with_is_a_kill(tree: Path) -> None:
+    (tree / "tests" / "conftest.py").write_text("from ages import adult\nassert adult(18)\n")
+    mutant = next(mutant for mutant in mutants("ages.py", AGES) if mutant.after == ">")
+    with Suite(tree) as suite:
+        said = copies.judge(suite, mutant, ["ages.py"], ["tests/test_ages.py"], 1.0)
+    assert said["verdict"] == "killed"
+    assert "conftest.py" in said["by"]
+
+
 def test_what_does_not_compile_is_no_kill(tree: Path) -> None:
     mutant = Mutant("ages.py", 1, 0, "truth", "def", "(", "def adult(age):", 0, 3)
     with Suite(tree) as suite:

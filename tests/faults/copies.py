@@ -19,7 +19,7 @@ from tests.faults.warm import Suite
 
 Baseline = dict[str, Any]  # of a test file, as `Reach.entered` says
 
-FAILED = re.compile(r"^(?:FAILED|ERROR) (\S+)", re.MULTILINE)
+FAILED = re.compile(r"^(?:FAILED|ERROR|ImportError while loading conftest) (\S+)", re.MULTILINE)
 TIMES, COMPILING_S = 2.0, 60.0  # a mutant hangs that computes this many times as long and as many s for kernels
 NOT_RUN = (4, 5)  # pytest's exit codes for a wrong command line and for no tests
 
