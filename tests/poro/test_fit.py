@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import pairwise
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -248,6 +250,16 @@ def test_a_start_where_no_pressure_is_felt_comes_back_through_the_prior(system: 
     found = fit_collapse(system, target, FitSettings(starts=start, free=(True, False, False)))
     assert lost.theta.kappa_b < 1e-12
     assert np.log10(found.theta.kappa_b) == pytest.approx(np.log10(TRUE.kappa_b), abs=0.05)
+
+
+@pytest.mark.parametrize("last_is_free", [True, False])
+def test_identifiability_is_of_the_fit_s_covariance_given_what_is_held(system: PoroSystem, last_is_free: bool) -> None:
+    whole = np.array([[4.0, 1.0, 0.5], [1.0, 2.0, 0.3], [0.5, 0.3, 1.0]])
+    fit: Any = SimpleNamespace(covariance=whole, free=np.array([True, True, last_is_free]), theta=TRUE)
+    known = identifiability(fit, system)
+    given = whole if last_is_free else whole[:2, :2] - np.outer(whole[:2, 2], whole[2, :2]) / whole[2, 2]
+    assert_allclose(known.sigma, np.sqrt(np.diag(given)))
+    assert_allclose(known.correlation, given / np.outer(known.sigma, known.sigma))
 
 
 def test_identifiability_names_what_is_held_and_what_ended_at_a_bound(system: PoroSystem, truth: PoroState) -> None:
