@@ -19,16 +19,19 @@ import tomllib
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import ExitStack
 from dataclasses import asdict
 from fnmatch import fnmatch
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from tests.faults.copies import baseline, copy_tree, judge
+from tests.faults.copies import Baseline, baseline, copy_tree, entering, judge
 from tests.faults.imports import Imports
 from tests.faults.mutants import Mutant, mutants, sibling_fields
 from tests.faults.table import Name, Record, name_of, table
+from tests.faults.warm import Suite
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -71,7 +74,13 @@ DEMO = "tests/vatsloc/test_localize.py"
 WHOLE_RUNS = (DEMO, "tests/vatsloc/test_state.py", "tests/vatsloc/test_two_scans.py")  # minutes for each mutant
 DEMO_WORDS = ("-k", "not killed and not change_nothing")  # these run the demo again and judge how files are handled
 STEPS = 2  # a test judges what it imports, and what that imports
+FIRST = (1, 4)  # of them all mutants are put to the first, those that are left to the next, then to the rest
 MOST = 12  # test files for one mutant; a number, since seconds would let a busy machine choose
+WARM = (
+    "pytest hypothesis numpy numpy.testing scipy.sparse.linalg scipy.ndimage scipy.spatial scipy.optimize scipy.stats "
+    "scipy.interpolate scipy.linalg numba skfem pyamg pydantic nibabel pydicom nrrd meshio skimage.measure "
+    "skimage.segmentation cv2 typer rich jinja2 matplotlib"
+)
 JUDGED = "tests/mutation_judged.toml"
 
 
@@ -108,9 +117,9 @@ def within_reach(imports: Imports, file: str) -> dict[str, int]:
     return {test: step for test, step in found.items() if step <= limit}
 
 
-def first_in_turn(steps: Mapping[str, int], seconds: Mapping[str, float]) -> list[str]:
-    """Test files in the order they run, nearest and fastest first, as many as a mutant is put to."""
-    return sorted(steps, key=lambda test: (steps[test], seconds[test]))[:MOST]
+def first_in_turn(imports: Imports, steps: Mapping[str, int]) -> list[str]:
+    """Test files in the order they run, as many as a mutant is put to: nearest first, then those that reach least."""
+    return sorted(steps, key=lambda test: (steps[test], len(imports.reached(test)), test))[:MOST]
 
 
 def read_records(log: Path) -> dict[Name, Record]:
@@ -119,24 +128,28 @@ def read_records(log: Path) -> dict[Name, Record]:
     return {name_of(record): record for record in map(json.loads, lines)}
 
 
-def work_off(tasks: Iterable[Callable[[Path], Record]], trees: Sequence[Path], log: Path) -> dict[Name, Record]:
-    """Run each task in a free copy of the tree and write its record as soon as it is there."""
-    free: queue.SimpleQueue[Path] = queue.SimpleQueue()
-    for tree in trees:
-        free.put(tree)
+def work_off(
+    tasks: Iterable[Callable[[Suite], Record | None]], suites: Sequence[Suite], log: Path
+) -> dict[Name, Record]:
+    """Run each task in a free copy of the tree and write its record as soon as it is there, None for not yet."""
+    free: queue.SimpleQueue[Suite] = queue.SimpleQueue()
+    for suite in suites:
+        free.put(suite)
 
-    def in_free_tree(task: Callable[[Path], Record]) -> Record:
-        tree = free.get()
+    def in_free_tree(task: Callable[[Suite], Record | None]) -> Record | None:
+        suite = free.get()
         try:
-            return task(tree)
+            return task(suite)
         finally:
-            free.put(tree)
+            free.put(suite)
 
     records: dict[Name, Record] = {}
-    with ThreadPoolExecutor(len(trees)) as pool, log.open("a", encoding="utf-8") as lines:
+    with ThreadPoolExecutor(len(suites)) as pool, log.open("a", encoding="utf-8") as lines:
         try:
             for done in as_completed([pool.submit(in_free_tree, task) for task in tasks]):
                 record = done.result()
+                if record is None:
+                    continue
                 lines.write(json.dumps(record) + "\n")
                 lines.flush()
                 records[name_of(record)] = record
@@ -147,39 +160,66 @@ def work_off(tasks: Iterable[Callable[[Path], Record]], trees: Sequence[Path], l
     return records
 
 
+class Baselines:
+    """What test files take and enter without a fault, each found out when it is asked for, and kept in a file."""
+
+    def __init__(self, log: Path, words: Sequence[str]) -> None:
+        self.log, self.words = log, words
+        self.told: dict[str, Baseline] = json.loads(log.read_text("utf-8")) if log.exists() else {}
+
+    def of(self, suite: Suite, test: str) -> Baseline:
+        """Of one test file, run in this copy of the tree where it has not been."""
+        if test not in self.told:
+            self.told[test] = baseline(suite, test, *self.words)
+            self.log.write_text(json.dumps(self.told), encoding="utf-8")
+        return self.told[test]
+
+
 def verdicts(found: Sequence[Mutant], judges: Scope, imports: Imports, asked: argparse.Namespace) -> list[Record]:
     """Verdicts on mutants: those written before, the others by the tests, where asked survivors by the demo run."""
     log = asked.out / "mutants.jsonl"
     sample = {name_of(asdict(mutant)): mutant for mutant in found}
     records = {name: record for name, record in read_records(log).items() if name in sample}
-    waiting = [mutant for name, mutant in sample.items() if name not in records]
-    files = {mutant.file for mutant in waiting}
+    files = {mutant.file for name, mutant in sample.items() if name not in records}
     steps = {file: dict.fromkeys(judges[file] or (), 1) or within_reach(imports, file) for file in files}
+    turns = {file: first_in_turn(imports, steps[file]) for file in files}
+    without = [f"--deselect={test}" for test in asked.deselect]
+    known = Baselines(asked.out / "baseline.json", without)
 
-    def by_tests(mutant: Mutant, tree: Path) -> Record:
-        tests = first_in_turn(steps[mutant.file], seconds)
-        usual = sum(seconds[test] for test in tests)
-        said = judge(tree, mutant, imports.compiled_with(mutant.file), [*tests, *without] if tests else [], usual)
-        return asdict(mutant) | {"tests": tests} | said
+    def by_tests(first: int, last: int, mutant: Mutant, suite: Suite) -> Record | None:
+        function, stale = imports.function(mutant.file, mutant.line), imports.compiled_with(mutant.file)
+        record = asdict(mutant) | {"tests": turns[mutant.file], "verdict": "survived", "by": "", "seconds": 0.0}
+        tests = turns[mutant.file][first:last]
+        new = [[test] for test in tests if test not in known.told]
+        for part in ([test for test in tests if test in known.told], *new):  # those whose seconds are known at once
+            chosen = {test: dict(entering(known.of(suite, test), function)) for test in part}
+            chosen = {test: named for test, named in chosen.items() if named}
+            usual = sum(took for named in chosen.values() for took in named.values())
+            only = [name for named in chosen.values() for name in named]
+            said = judge(suite, mutant, stale, [*chosen, *without] if chosen else [], usual, only)
+            record |= said | {"seconds": record["seconds"] + said["seconds"]}
+            if said["verdict"] != "survived":
+                return record
+        return record if last >= len(turns[mutant.file]) else None
 
-    def by_demo(record: Record, tree: Path) -> Record:
+    def by_demo(record: Record, suite: Suite) -> Record:
         mutant = sample[name_of(record)]
-        said = judge(tree, mutant, imports.compiled_with(mutant.file), [DEMO, *DEMO_WORDS, *without], demo_seconds)
+        words = [DEMO, *DEMO_WORDS, *without]
+        said = judge(suite, mutant, imports.compiled_with(mutant.file), words, demo_seconds)
         return record | {"demo": said["by"] or said["verdict"]}
 
-    without = [f"--deselect={test}" for test in asked.deselect]
-    with tempfile.TemporaryDirectory(prefix="mutation-") as base:
+    with tempfile.TemporaryDirectory(prefix="mutation-") as base, ExitStack() as open_suites:
         trees = [Path(base, str(job), "tree") for job in range(asked.jobs)]
-        copy_tree(imports.root, trees[0], asked.out)
-        reached = sorted({test for tests in steps.values() for test in tests})
-        seconds = baseline(trees[0], reached, *without, log=asked.out / "seconds.json")
-        for tree in trees[1:]:
-            copy_tree(trees[0], tree, asked.out)
-        records |= work_off([partial(by_tests, mutant) for mutant in waiting], trees, log)
+        for tree in trees:
+            copy_tree(imports.root, tree, asked.out)
+        suites = [open_suites.enter_context(Suite(tree, asked.warm.split())) for tree in trees]
+        for first, last in pairwise((0, *FIRST, MOST)):
+            left = [mutant for name, mutant in sample.items() if name not in records]
+            records |= work_off([partial(by_tests, first, last, mutant) for mutant in left], suites, log)
         alive = [record for record in records.values() if record["verdict"] == "survived" and "demo" not in record]
         if alive and asked.end_to_end:
-            demo_seconds = sum(baseline(trees[0], [DEMO], *DEMO_WORDS, *without).values())
-            records |= work_off([partial(by_demo, record) for record in alive], trees, log)
+            demo_seconds = sum(took for _, took in baseline(suites[0], DEMO, *DEMO_WORDS, *without)["tests"])
+            records |= work_off([partial(by_demo, record) for record in alive], suites, log)
     return [records[name] for name in sample]
 
 
@@ -194,6 +234,7 @@ def main(words: Sequence[str] | None = None, root: Path = ROOT, scope: Scope = S
     parser.add_argument("--jobs", type=int, default=1, help="mutants judged at a time, each in a copy of its own")
     parser.add_argument("--end-to-end", action="store_true", help="put survivors to the demo run too")
     parser.add_argument("--deselect", action="append", default=[], help="test that fails here without a fault too")
+    parser.add_argument("--warm", default=WARM, help="modules imported once, not for every mutant")
     asked = parser.parse_args(words)
     asked.out.mkdir(parents=True, exist_ok=True)
 

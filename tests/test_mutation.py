@@ -15,6 +15,7 @@ from tests.faults import copies
 from tests.faults.imports import Imports
 from tests.faults.mutants import OPERATORS, Mutant, mutants, sibling_fields
 from tests.faults.table import Record, table
+from tests.faults.warm import Suite
 
 CHANGES = [
     ("comparison", "a < b", ["a <= b", "a > b"]),
@@ -164,7 +165,7 @@ def test_scope_names_files_that_are_there(tree: Path) -> None:
         mutation.in_scope(tree, {"ages.py": (), "gone.py": ()})
 
 
-def test_tests_are_found_by_their_imports_nearest_and_fastest_first(tmp_path: Path) -> None:
+def test_tests_are_found_by_their_imports_nearest_and_narrowest_first(tmp_path: Path) -> None:
     for file, text in {
         "pack/__init__.py": "from pack.inner import f",
         "pack/inner.py": "from far import g\ndef f(): return g()",
@@ -183,9 +184,10 @@ def test_tests_are_found_by_their_imports_nearest_and_fastest_first(tmp_path: Pa
     assert mutation.within_reach(imports, "pack/inner.py") == {near: 1, scene: 2}
     assert mutation.within_reach(imports, "far.py") == {near: 2}
     assert mutation.within_reach(imports, "farther.py") == {near: 3}
-    assert mutation.first_in_turn({"a": 2, "b": 1, "c": 1}, {"a": 1, "b": 9, "c": 2}) == ["c", "b", "a"]
-    many = {str(step): step for step in range(20)}
-    assert mutation.first_in_turn(many, dict.fromkeys(many, 1.0)) == list(many)[: mutation.MOST]
+    steps = {scene: 1, "tests/test_other.py": 1, near: 1, "pack/inner.py": 2, "far.py": 1}
+    expected = ["far.py", "tests/test_other.py", near, scene, "pack/inner.py"]  # those of a step by what they reach
+    assert mutation.first_in_turn(imports, steps) == expected
+    assert mutation.first_in_turn(imports, dict.fromkeys(imports.trees, 1))[:1] == ["alone.py"]
 
 
 def test_kernels_are_stale_with_what_they_hold(tmp_path: Path) -> None:
@@ -223,7 +225,7 @@ def test_verdicts_are_right_and_are_taken_up_again(tree: Path, tmp_path: Path) -
     out = tmp_path / "out"
 
     def run(*words: str) -> list[Record]:
-        command = ["--out", str(out), "--only", "*.py", "--seed", "3", *words]
+        command = ["--out", str(out), "--only", "*.py", "--seed", "3", "--warm", "", *words]
         mutation.main(command, tree, {"ages.py": (), "tests/*.py": None})
         return [json.loads(line) for line in (out / "mutants.jsonl").read_text().splitlines()]
 
@@ -246,8 +248,9 @@ def test_a_mutant_that_hangs_is_ended_in_time(tree: Path, monkeypatch: pytest.Mo
     (tree / "ages.py").write_text(text)
     (mutant,) = (mutant for mutant in mutants("ages.py", text) if mutant.after == ">" and mutant.before == "<")
     start = time.monotonic()
-    assert copies.judge(tree, mutant, ["ages.py"], ["tests/test_ages.py"], 0.0)["verdict"] == "timeout"
-    assert time.monotonic() - start < 20
+    with Suite(tree) as suite:
+        assert copies.judge(suite, mutant, ["ages.py"], ["tests/test_ages.py"], 0.0)["verdict"] == "timeout"
+    assert time.monotonic() - start < 60
 
 
 def test_tests_that_fail_without_a_fault_end_the_run_unless_left_out(tree: Path, tmp_path: Path) -> None:
@@ -255,7 +258,7 @@ def test_tests_that_fail_without_a_fault_end_the_run_unless_left_out(tree: Path,
     (tree / "tests" / "test_first.py").write_text(
         "from ages import first\n\n\ndef test_first(): assert first([1]) == 1\n"
     )
-    words = ["--out", str(tmp_path), "--number", "1"]
+    words = ["--out", str(tmp_path), "--number", "1", "--warm", ""]
     with pytest.raises(SystemExit, match="mend them first"):
         mutation.main(words, tree, {"ages.py": ()})
     mutation.main([*words, "--deselect", "tests/test_ages.py::test_adult"], tree, {"ages.py": ()})
@@ -263,9 +266,19 @@ def test_tests_that_fail_without_a_fault_end_the_run_unless_left_out(tree: Path,
     assert (record["operator"], record["verdict"]) == ("comparison", "survived")
 
 
+def test_a_fault_that_no_conftest_can_be_imported_with_is_a_kill(tree: Path) -> None:
+    (tree / "tests" / "conftest.py").write_text("from ages import adult\nassert adult(18)\n")
+    mutant = next(mutant for mutant in mutants("ages.py", AGES) if mutant.after == ">")
+    with Suite(tree) as suite:
+        said = copies.judge(suite, mutant, ["ages.py"], ["tests/test_ages.py"], 1.0)
+    assert said["verdict"] == "killed"
+    assert "conftest.py" in said["by"]
+
+
 def test_what_does_not_compile_is_no_kill(tree: Path) -> None:
     mutant = Mutant("ages.py", 1, 0, "truth", "def", "(", "def adult(age):", 0, 3)
-    verdict = copies.judge(tree, mutant, ["ages.py"], ["tests/test_ages.py"], 1.0)
+    with Suite(tree) as suite:
+        verdict = copies.judge(suite, mutant, ["ages.py"], ["tests/test_ages.py"], 1.0)
     assert verdict["verdict"] == "does not compile"
 
 

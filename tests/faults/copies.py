@@ -6,24 +6,21 @@ import json
 import os
 import re
 import shutil
-import signal
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 
 from tests.faults.imports import LEFT_OUT
 from tests.faults.mutants import Mutant
+from tests.faults.warm import Suite
 
-FAILED = re.compile(r"^(?:FAILED|ERROR) (\S+)", re.MULTILINE)
-FAILED_FILE = re.compile(r"^(?:FAILED|ERROR) ([^\s:]+)", re.MULTILINE)
-TIMES, COMPILING_S = 2.0, 60.0  # a mutant hangs that takes this many times as long and as many seconds for kernels
-RUN = (0, 1, 5)  # pytest's exit codes for all passed, some failed, and none left after --deselect
+Baseline = dict[str, Any]  # of a test file, as `Reach.entered` says
+
+FAILED = re.compile(r"^(?:FAILED|ERROR|ImportError while loading conftest) (\S+)", re.MULTILINE)
+TIMES, COMPILING_S = 2.0, 60.0  # a mutant hangs that computes this many times as long and as many s for kernels
 NOT_RUN = (4, 5)  # pytest's exit codes for a wrong command line and for no tests
 
 
@@ -36,48 +33,26 @@ def copy_tree(root: Path, tree: Path, out: Path) -> None:
     shutil.copytree(root, tree, ignore=left_out)
 
 
-def run_tests(tree: Path, words: Sequence[str], timeout: float | None = None) -> tuple[int | None, str]:
-    """Exit code of pytest in a tree, None where it takes longer than `timeout` s, and what it says."""
-    inherited = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
-    process = subprocess.Popen(
-        [sys.executable, "-m", "pytest", "-q", "--tb=no", "-n0", "-p", "no:cacheprovider", *words],
-        cwd=tree,
-        env=inherited | {"PYTHONPATH": str(tree), "OPENBLAS_NUM_THREADS": "1"},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        start_new_session=True,  # so that whatever a test started ends with it
-    )
-    try:
-        said, _ = process.communicate(timeout=timeout)
-    except subprocess.TimeoutExpired:
-        return None, ""
-    finally:
-        if process.poll() is None:
-            os.killpg(process.pid, signal.SIGKILL)
-            process.communicate()
-    return process.returncode, said
+def baseline(suite: Suite, test: str, *words: str) -> Baseline:
+    """Seconds of a test file's tests without a fault and what they enter; kernels are compiled on the way.
 
-
-def baseline(tree: Path, tests: Sequence[str], *words: str, log: Path | None = None) -> dict[str, float]:
-    """Seconds of each test file without a fault, kernels being compiled on the way. Exits where a test fails.
-
-    log: JSON file of the seconds of files that passed, which are not run again.
+    Exits where a test fails.
     """
-    known: dict[str, float] = json.loads(log.read_text("utf-8")) if log is not None and log.exists() else {}
-    waiting = [test for test in tests if test not in known]
-    if waiting:
-        report = tree.parent / "baseline.xml"
-        code, said = run_tests(tree, [*waiting, *words, f"--junitxml={report}"])
-        seconds, failed = dict.fromkeys(waiting, 0.0), set(FAILED_FILE.findall(said))
-        for case in ElementTree.parse(report).iter("testcase") if code in RUN else ():
-            seconds[f"{case.attrib['classname'].replace('.', '/')}.py"] += float(case.attrib["time"])
-        known |= {test: took for test, took in seconds.items() if code in RUN and test not in failed}
-        if log is not None:
-            log.write_text(json.dumps(known, indent=1), encoding="utf-8")
-        if code not in (0, 5):
-            raise SystemExit(f"The tests fail without a fault (pytest exits with {code}); mend them first.\n{said}")
-    return {test: known[test] for test in tests}
+    told = suite.tree.parent / "reach.json"
+    told.unlink(missing_ok=True)
+    code, said = suite.run([test, *words], reach=told)
+    if code not in (0, 5) or not told.exists():
+        raise SystemExit(f"The tests fail without a fault (pytest exits with {code}); mend them first.\n{said}")
+    made: Baseline = json.loads(told.read_text("utf-8"))
+    return made
+
+
+def entering(told: Baseline, function: str | None) -> list[tuple[str, float]]:
+    """Of a file's tests those that enter a function, each with its seconds; all where it is not known."""
+    if function is None or function in told["always"]:
+        return [(name, took) for name, took in told["tests"]]
+    numbers = sorted({*told["reach"].get(function, ()), *told["outside"]})
+    return [(name, took) for name, took in (told["tests"][number] for number in numbers)]
 
 
 @contextmanager
@@ -105,20 +80,23 @@ def planted(tree: Path, mutant: Mutant, stale: Iterable[str]) -> Iterator[None]:
                 place.rename(made)
 
 
-def judge(tree: Path, mutant: Mutant, stale: Iterable[str], words: Sequence[str], usual_s: float) -> dict[str, Any]:
+def judge(
+    suite: Suite, mutant: Mutant, stale: Iterable[str], words: Sequence[str], usual_s: float, only: Sequence[str] = ()
+) -> dict[str, Any]:
     """Verdict of pytest's `words`, which take `usual_s` without a fault, on a mutant; by: the test that failed.
 
-    Verdicts are killed, survived, timeout and "does not compile"; a mutant that no test reaches survives.
+    only: names of the tests to run, all where there are none. Verdicts are killed, survived, timeout and "does not
+    compile"; a mutant that no test reaches survives.
     """
     if not words:
         return {"verdict": "survived", "by": "", "seconds": 0.0}
     start = time.perf_counter()
     try:
-        compile(mutant.plant((tree / mutant.file).read_text(encoding="utf-8")), mutant.file, "exec")
+        compile(mutant.plant((suite.tree / mutant.file).read_text(encoding="utf-8")), mutant.file, "exec")
     except SyntaxError as error:
         return {"verdict": "does not compile", "by": str(error), "seconds": 0.0}
-    with planted(tree, mutant, stale):
-        code, said = run_tests(tree, ["-x", *words], TIMES * usual_s + COMPILING_S)
+    with planted(suite.tree, mutant, stale):
+        code, said = suite.run(["-x", *words], TIMES * usual_s + COMPILING_S, only)
     failed = FAILED.search(said)
     if code in NOT_RUN and not failed:
         raise RuntimeError(f"pytest cannot run {' '.join(words)}:\n{said}")

@@ -42,6 +42,19 @@ class Imports:
             waiting += using
         return found
 
+    def function(self, file: str, line: int) -> str | None:
+        """`file:line` of the innermost function whose body holds a line, by its own first line, as Python counts it.
+
+        None outside of functions and in a kernel, which nobody sees entered.
+        """
+        found = None
+        for node in ast.walk(self.trees[file]):  # outer ones first
+            if isinstance(node, ast.FunctionDef) and node.body[0].lineno <= line <= (node.end_lineno or 0):
+                if any("jit" in ast.unparse(word) for word in node.decorator_list):
+                    return None
+                found = f"{file}:{min(part.lineno for part in (node, *node.decorator_list))}"
+        return found
+
     def _imported(self, file: str) -> Iterator[tuple[str, str]]:
         """Names a file imports from others of the tree, each with the file that defines it."""
         for node in ast.walk(self.trees[file]):

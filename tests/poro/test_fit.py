@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import pairwise
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -96,6 +98,23 @@ def test_distances_are_to_the_surface_and_with_plain_to_its_nearest_node(system:
     nearest = np.linalg.norm(points[:, None] - boundary.points, axis=2).min(axis=1)
     plain = Observer(system.mesh, target, plain=True).residuals(still).value.reshape(-1, 3)
     assert_allclose(np.linalg.norm(plain, axis=1), nearest)
+
+
+@pytest.mark.parametrize(("degrees", "share"), [(0.0, 1.0), (60.0, 0.5), (90.0, 0.0), (150.0, 0.0)])
+def test_a_target_point_whose_normal_disagrees_loses_weight_and_an_opposed_one_all(
+    system: PoroSystem, degrees: float, share: float
+) -> None:
+    """Above the surface's nodes, which are nearest, by their normals turned about the tangent nearest to A."""
+    boundary, still = system.mesh.boundary, np.zeros_like(system.mesh.points)
+    up = boundary.node_normals
+    across = np.cross(up, [0.0, 1.0, 0.0])
+    across /= np.linalg.norm(across, axis=1)[:, None]
+    turn = np.deg2rad(degrees)
+    confidence = np.linspace(0.2, 1.0, len(up))
+    target = Target(boundary.points + up, np.cos(turn) * up + np.sin(turn) * across, confidence)
+    rows = Observer(system.mesh, target).residuals(still)
+    assert_allclose(rows.value, 1.0, atol=1e-9)
+    assert_allclose(rows.weight, share * confidence, atol=1e-9)
 
 
 def test_weights_do_not_hang_on_rounding(system: PoroSystem, truth: PoroState) -> None:
@@ -231,6 +250,16 @@ def test_a_start_where_no_pressure_is_felt_comes_back_through_the_prior(system: 
     found = fit_collapse(system, target, FitSettings(starts=start, free=(True, False, False)))
     assert lost.theta.kappa_b < 1e-12
     assert np.log10(found.theta.kappa_b) == pytest.approx(np.log10(TRUE.kappa_b), abs=0.05)
+
+
+@pytest.mark.parametrize("last_is_free", [True, False])
+def test_identifiability_is_of_the_fit_s_covariance_given_what_is_held(system: PoroSystem, last_is_free: bool) -> None:
+    whole = np.array([[4.0, 1.0, 0.5], [1.0, 2.0, 0.3], [0.5, 0.3, 1.0]])
+    fit: Any = SimpleNamespace(covariance=whole, free=np.array([True, True, last_is_free]), theta=TRUE)
+    known = identifiability(fit, system)
+    given = whole if last_is_free else whole[:2, :2] - np.outer(whole[:2, 2], whole[2, :2]) / whole[2, 2]
+    assert_allclose(known.sigma, np.sqrt(np.diag(given)))
+    assert_allclose(known.correlation, given / np.outer(known.sigma, known.sigma))
 
 
 def test_identifiability_names_what_is_held_and_what_ended_at_a_bound(system: PoroSystem, truth: PoroState) -> None:

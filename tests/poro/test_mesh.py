@@ -132,3 +132,15 @@ def test_points_are_located_in_a_mesh_turned_inside_out() -> None:
     mirrored = TetMesh(mesh.points * [-1, 1, 1], mesh.tets)
     found = locate(mirrored, np.array([[3.0, 2.0, 1.0]]))
     assert_allclose(interpolate(found, mirrored.points)[0], [3, 2, 1], atol=1e-9)
+
+
+@pytest.mark.parametrize("tets", [np.zeros((2, 3), int), np.zeros(4, int), np.zeros((2, 4, 1), int)])
+def test_elements_of_another_shape_are_refused(tets: np.ndarray) -> None:
+    with pytest.raises(ValueError, match=r"tets must be \(m, 4\)"):
+        TetMesh(np.zeros((5, 3)), tets)
+
+
+@pytest.mark.parametrize("points", [np.zeros((5, 2)), np.zeros(3), np.zeros((5, 3, 1))])
+def test_nodes_of_another_shape_are_refused(points: np.ndarray) -> None:
+    with pytest.raises(ValueError, match=r"points must be \(n, 3\)"):
+        TetMesh(points, np.zeros((1, 4), int))

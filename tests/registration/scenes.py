@@ -12,12 +12,18 @@ Pattern = Callable[[Array], Array]
 
 
 def make_pattern(seed: int = 0, waves: int = 60, shortest_mm: float = 14.0) -> Pattern:
-    """HU at any points (n, 3): a sum of cosines in random directions, wavelengths `shortest_mm` to 6 times that."""
+    """HU at any points (..., 3): a sum of cosines in random directions, wavelengths `shortest_mm` to 6 times that."""
     rng = np.random.default_rng(seed)
     k = rng.normal(size=(waves, 3))
     k *= (2 * np.pi / (shortest_mm * rng.uniform(1, 6, waves)) / np.linalg.norm(k, axis=1))[:, None]
     phase, height = rng.uniform(0, 2 * np.pi, waves), rng.uniform(20, 60, waves)
-    return lambda points: -500 + np.cos(points @ k.T + phase) @ height
+
+    def pattern(points: Array) -> Array:
+        flat = points.reshape(-1, 3)
+        parts = np.array_split(flat, len(flat) // 2048 + 1)  # small enough for the processor's cache
+        return np.concatenate([-500 + np.cos(x @ k.T + phase) @ height for x in parts]).reshape(points.shape[:-1])
+
+    return pattern
 
 
 def image_of(pattern: Pattern, grid: Grid) -> Volume:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 import pytest
 
@@ -37,6 +39,7 @@ def given(points: Array) -> Linearized:
     return Linearized(moved(points) + OFF_MM, np.broadcast_to(STRETCH, (len(points), 3, 3)))
 
 
+@lru_cache(maxsize=2)
 def images(wall: bool) -> tuple[Volume, Volume, Regions]:
     """One organ in two images; with a wall, something else lies beyond it and slides."""
     fixed, moving = grid(36.0, 1.5), grid(60.0, 1.5)

@@ -34,6 +34,11 @@ def test_the_inverse_of_an_affine_map_by_value() -> None:
     assert_allclose(found.points_fixed, (y - [5.0, -3.0, 2.0]) @ np.linalg.inv(a).T, atol=1e-6)
 
 
+def test_the_inverse_of_a_shift_takes_one_step() -> None:
+    found = invert_at(lambda x: x + np.array([5.0, -3.0, 2.0]), inner_points())
+    assert found.iterations == 1
+
+
 def test_residuals_are_what_is_left() -> None:
     field, y = bump(3.0), inner_points()
     found = invert_at(field, y)

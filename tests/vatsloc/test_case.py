@@ -8,11 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from pydantic import ValidationError
 
 from registration.volume import Mask, axis_codes
 from tests.vatsloc.case_scene import CENTRE, IMAGES, ball, chest, grid_at, point, whole_case, write_toml
 from vatsloc.case import read_case, read_landmarks
 from vatsloc.errors import CaseError
+from vatsloc.formats.casefile import read_case_file
 from vatsloc.formats.meshes import write_stl
 from vatsloc.formats.nifti import write_mask, write_volume
 
@@ -35,6 +37,13 @@ def test_images_nodule_and_defaults(folder):
     assert case.warnings == ()
     assert case.hints.lung_mask_ct is None
     assert case.input_sha256["ct"] == hashlib.sha256((folder / "ct.nii.gz").read_bytes()).hexdigest()
+
+
+@pytest.mark.parametrize("table", ["", "images", "hints"])
+def test_what_a_case_file_says_cannot_be_changed_once_read(folder, table):
+    file = read_case_file(folder)
+    with pytest.raises(ValidationError, match="frozen"):
+        setattr(getattr(file, table) if table else file, {"": "side", "images": "ct"}.get(table, "spine_ct"), None)
 
 
 @pytest.mark.parametrize("codes", ["RAS", "LAS", "SAL", "PIR"])

@@ -229,6 +229,8 @@ def test_modality_lut_from_a_negative_value_holds_its_ends(tmp_path):
         (lambda ds: delattr(ds, "RescaleIntercept"), "states RescaleSlope but no RescaleIntercept"),
         (lambda ds: delattr(ds, "RescaleSlope"), "states RescaleIntercept but no RescaleSlope"),
         (lambda ds: setattr(ds, "RescaleSlope", -1), "a positive slope"),
+        (lambda ds: setattr(ds, "RescaleSlope", 1e6), "a positive slope"),
+        (lambda ds: setattr(ds, "RescaleIntercept", -1e6), "a positive slope"),
         (lambda ds: setattr(ds, "RescaleType", "Z_EFF"), "RescaleType = Z_EFF, HU needed"),
         (lambda ds: setattr(ds, "HighBit", 11), "HighBit = 11, a whole number from 15 to 15"),
         (lambda ds: setattr(ds, "PhotometricInterpretation", "PALETTE COLOR"), "MONOCHROME2 needed"),

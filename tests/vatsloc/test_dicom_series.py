@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -233,6 +234,16 @@ def test_a_slice_that_shifts_sideways_is_refused(tmp_path, slices):
     slices[3].ImagePositionPatient[1] += 0.4
     with pytest.raises(InputRefused, match=r"shift sideways, the one at -36\.5 mm by 0\.40 mm; export"):
         read_volume(save(tmp_path / "ct", slices))
+
+
+@pytest.mark.parametrize(("sideways_mm", "refused"), [(0.07, False), (0.09, True)])
+def test_slices_may_shift_sideways_by_a_twentieth_of_the_smaller_pixel_spacing(tmp_path, slices, sideways_mm, refused):
+    for ds in slices:
+        ds.PixelSpacing = [2.4, 1.6]
+    slices[3].ImagePositionPatient[1] += sideways_mm
+    folder = save(tmp_path / "ct", slices)
+    with pytest.raises(InputRefused, match="shift sideways") if refused else nullcontext():
+        read_volume(folder)
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
@@ -17,6 +18,7 @@ from registration.volume import Grid, Mask, Volume
 from vatsloc.case import sha256
 from vatsloc.errors import CaseError, InputRefused
 from vatsloc.evaluation import evaluate_case, table
+from vatsloc.evaluation.inputs import MAX_BEYOND_MM, _check_extent, _check_place
 from vatsloc.formats.markups import PointList, write_points
 from vatsloc.formats.meshes import Surface, TetraMesh, read_vtu, write_vtu
 from vatsloc.formats.nifti import write_volume
@@ -273,6 +275,21 @@ def test_landmarks_never_placed_are_left_out_and_said(folders):
     scores = evaluate_case(case, result)
     assert scores["phase1"]["n"] == len(CT) - 1
     assert "1 label(s) without a counterpart were left out: L4." in scores["warnings"]
+
+
+@pytest.mark.parametrize(("beyond_mm", "refused"), [(MAX_BEYOND_MM, False), (MAX_BEYOND_MM + 1, True)])
+def test_landmarks_may_lie_a_stated_length_beyond_their_image(beyond_mm, refused):
+    grid = Grid((10, 20, 30), np.eye(4))
+    for at in ([-beyond_mm, 4.0, 5.0], [9 + beyond_mm, 4.0, 5.0]):
+        with pytest.raises(InputRefused, match="beyond it") if refused else nullcontext():
+            _check_place(PointList(np.array([at]), ("1",)), grid, "ct.nii.gz")
+
+
+@pytest.mark.parametrize("n", [2, 3])
+def test_the_span_of_three_landmarks_is_judged_and_of_two_not(n):
+    points = PointList(np.outer(np.arange(n), [0.01, 0.01, 0.01]), tuple("abc"[:n]))
+    with pytest.raises(InputRefused, match="3 landmarks of ct") if n == 3 else nullcontext():
+        _check_extent(points, "ct.nii.gz")
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import zlib
+from contextlib import nullcontext
+from pathlib import Path
 
 import nibabel
 import nrrd
@@ -24,6 +26,7 @@ from tests.vatsloc.image_files import (
 )
 from vatsloc.errors import CaseError, InputRefused
 from vatsloc.formats.images import read_mask, read_volume
+from vatsloc.formats.raw import check_voxel_size
 
 
 def sheared() -> np.ndarray:
@@ -224,6 +227,13 @@ def test_nifti_whose_voxel_size_contradicts_its_matrix_is_refused(tmp_path):
     sentence = r"two voxel sizes: 1 x 1 x 1 mm as pixdim, 0\.5 x 1\.5 x 2 mm by its matrix; programs differ in which"
     with pytest.raises(InputRefused, match=sentence):
         read_volume(tmp_path / "ct.nii")
+
+
+@pytest.mark.parametrize(("off_mm", "refused"), [(0.9, False), (1.1, True)])
+def test_two_statements_of_the_voxel_size_may_place_a_corner_a_millimetre_apart(off_mm, refused):
+    stated = np.array([0.5, 1.5 + off_mm / 100, 2.0])
+    with pytest.raises(InputRefused, match="two voxel sizes") if refused else nullcontext():
+        check_voxel_size(stated, np.diag([0.5, 1.5, 2.0, 1.0]), (51, 101, 41), "pixdim", Path("ct.nii"))
 
 
 @pytest.mark.parametrize("size", [0.0, -1.5, np.nan, np.inf])

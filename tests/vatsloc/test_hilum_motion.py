@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from registration.volume import Array, Mask
+from registration.volume import Array, Mask, Volume
 from tests.vatsloc import ball_scene as scene
 from vatsloc.imaging.airways import TrackedAirways
-from vatsloc.imaging.hilum import Hilum
+from vatsloc.imaging.hilum import Hilum, track_hilum
 from vatsloc.workflow import hilum
 from vatsloc.workflow.hilum import HilumMotion, HilumSource, _Shifted, hilum_motion
 
@@ -142,6 +142,25 @@ def test_a_registration_that_goes_astray_folds_or_cannot_be_turned_round_gives_w
     # All of space on one plane: most points are not reached.
     flat = found(monkeypatch, Registration(lambda points: right(points) * [1, 1, 0] + [0, 0, scene.CENTRE_INF[2]]))
     assert flat.source is HilumSource.SHIFT
+
+
+def test_of_the_airways_those_about_the_hilum_alone_tell_how_far_it_went() -> None:
+    """A tube of 6 mm at the hilum, and a thicker one 60 mm beside it that went another way."""
+    grid = scene.grid_about(AT, 64, 2.5)
+    off = grid.points() - AT
+
+    def tubes(near: Array, far: Array) -> Array:
+        along = np.abs(off[..., 2]) < 25.0
+        thin = np.linalg.norm((off - near)[..., :2], axis=-1) < 6.0
+        return along & (thin | (np.linalg.norm((off - far - [0.0, 60.0, 0.0])[..., :2], axis=-1) < 9.0))
+
+    went = np.array([7.5, -5.0, 0.0])
+    hu = np.where(tubes(went, np.array([-7.5, 5.0, 0.0])), -950.0, 0.0).astype(np.float32)
+    expected = Mask(tubes(np.zeros(3), np.zeros(3)), grid.ras_from_ijk)
+    tracked = track_hilum(scene.cbct(Volume(hu, grid.ras_from_ijk)), expected, AT)
+    assert_allclose(tracked.shift_mm[:2], went[:2], atol=1.3)
+    assert tracked.contrast_hu > 700.0
+    assert np.linalg.norm(off[tracked.inside], axis=1).max() < 40.0
 
 
 def test_airways_that_the_inflated_scan_does_not_see_move_the_hilum_as_a_whole(monkeypatch: pytest.MonkeyPatch) -> None:

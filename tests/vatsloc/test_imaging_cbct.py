@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from registration.volume import Volume
 from tests.vatsloc import imaging_thorax as known
 from vatsloc.errors import InputRefused
-from vatsloc.imaging.cbct import Cupping, _lean_and_fat, _ridge, field_of_view, prepare_cbct
+from vatsloc.imaging.cbct import Cupping, _lean_and_fat, _ridge, field_of_view, prepare_cbct, tissue_hu
 from vatsloc.imaging.spine import _column, segment_spine
 
 
@@ -25,6 +25,9 @@ def test_cylinder_and_bad_slices_are_found() -> None:
     slices = np.flatnonzero(field.usable.inside.any(axis=(0, 1)))
     ends = int(np.ceil(12.0 / known.SPACING))
     assert (slices[0], slices[-1]) == (ends, known.SHAPE[2] - ends - 1)
+    off = np.linalg.norm(cbct.grid.points()[..., :2] - [30.0, -10.0], axis=-1)
+    for mask, reach in ((field.mask, 90.0), (field.usable, 90.0 - 2 * known.SPACING)):
+        assert_allclose(off[mask.inside].max(), reach, atol=1.5)
 
 
 def test_cylinder_cut_by_the_image_keeps_its_circle() -> None:
@@ -82,6 +85,11 @@ def test_a_tissue_that_is_not_seen_is_none_in_the_entry() -> None:
     nowhere = {"air": np.nan, "lung": -850.0, "soft": 40.0}
     entry = Cupping(np.zeros(2), np.zeros(2), 1.0, nowhere, nowhere).entry()
     assert entry["hu_before"] == {"air": None, "lung": -850.0, "soft": 40.0}
+
+
+def test_a_peak_may_be_as_wide_as_two_steps_of_the_histogram() -> None:
+    hu = np.repeat([-852.0, -844.0, 36.0, 44.0], 50)
+    assert tissue_hu(hu) == {"air": pytest.approx(np.nan, nan_ok=True), "lung": -852.0, "soft": 36.0}
 
 
 def test_spine_is_the_column_of_vertebrae_in_ct_and_cbct() -> None:

@@ -12,6 +12,7 @@ from registration.volume import Mask, Volume
 from tests.vatsloc import imaging_thorax as known
 from vatsloc.case import read_case
 from vatsloc.errors import InputRefused
+from vatsloc.frames import Side
 from vatsloc.imaging.hilum import find_hilum
 from vatsloc.imaging.lungs import _midline, _sides, segment_lungs
 
@@ -62,6 +63,19 @@ def test_hilum_lies_where_the_bronchus_enters() -> None:
     guessed = find_hilum(lungs.left, Mask(np.zeros_like(lungs.left.inside), lungs.left.ras_from_ijk), "left")
     assert not guessed.on_airways
     assert -45.0 < guessed.point_ras[0] < -20.0
+
+
+@pytest.mark.parametrize("side", ["right", "left"])
+def test_without_airways_the_hilum_is_the_middle_of_the_face_not_what_reaches_farthest_in(side: Side) -> None:
+    """A lung whose medial face slants: its back lies 30 mm nearer to the middle than its front."""
+    g = known.grid((60, 70, 80), 2.0, (60.0 if side == "right" else -60.0, 0.0, 0.0))
+    x = g.points()
+    outward = x[..., 0] if side == "right" else -x[..., 0]
+    lung = (outward > 30 + 0.25 * x[..., 1]) & (outward < 110) & (np.abs(x[..., 1]) < 60) & (np.abs(x[..., 2]) < 70)
+    found = find_hilum(Mask(lung, g.ras_from_ijk), Mask(np.zeros_like(lung), g.ras_from_ijk), side)
+    assert abs(found.point_ras[1]) < 0.15 * 120 + 2.0
+    assert abs(found.point_ras[2] - 0.05 * 140) < 0.1 * 140 + 2.0
+    assert abs(found.point_ras[0]) < 36.0
 
 
 def test_nodule_at_the_pleura_belongs_to_the_lung() -> None:

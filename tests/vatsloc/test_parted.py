@@ -16,7 +16,15 @@ from tests.vatsloc import run_scene as known
 from vatsloc.workflow import parted as module
 from vatsloc.workflow.fissures import Fissure, Parted, Sheet
 from vatsloc.workflow.model_selection import Refinement
-from vatsloc.workflow.parted import JOINED_MM, _carried, _on_pieces, _with_residual, cut_lung, in_pieces
+from vatsloc.workflow.parted import (
+    JOINED_MM,
+    _carried,
+    _fitted,
+    _on_pieces,
+    _with_residual,
+    cut_lung,
+    in_pieces,
+)
 from vatsloc.workflow.pneumothorax import Collapse
 from vatsloc.workflow.pose import ChangeOfPose
 from vatsloc.workflow.residual import Residual
@@ -160,6 +168,36 @@ def test_a_piece_that_cannot_be_registered_stays_and_without_either_nothing_chan
     assert _with_residual(known.scene().prepared, pose, collapse, FLAT, Settings()) is collapse
     whole = replace(collapse, parted=None)
     assert _with_residual(known.scene().prepared, pose, whole, FLAT, Settings()) is whole
+
+
+@pytest.mark.parametrize("slid_mm", [8.0, 0.0])
+def test_a_lung_is_fitted_in_pieces_where_each_of_them_went_its_own_way_and_only_there(slid_mm: float) -> None:
+    scene = known.scene()
+    keypoints = known.CENTRE + np.random.default_rng(3).uniform(-18, 18, (200, 3))
+    apart = np.array([[slid_mm, 0, 3], [-slid_mm, 0, 3]])  # mm, of what lies above the fissure and below it
+    moving = BEFORE_FROM_CT(keypoints)
+    told = Correspondences.of(moving + apart[(keypoints[:, 2] < known.CENTRE[2]).astype(int)], moving)
+    unseen = scene.collapse.observed.surface.where(np.zeros(14, bool))
+    whole = (Refinement("elastic correction", 20.0, slid_mm, True),)  # as well as one piece can tell
+    scene = scene.with_model(correspondences=told, refinements=whole).with_observed(surface=unseen)
+    settings = Settings.model_validate({"mesh": {"edge_mm": 12.0, "model_edge_mm": 14.0}})
+    fitted = _fitted(scene.prepared, scene.pose, scene.collapse, FLAT, settings)
+    if slid_mm == 0:
+        assert fitted is None
+        return
+    assert fitted is not None
+    collapse = fitted[1]
+    assert collapse.parted is not None
+    pieces = collapse.parted.pieces
+    moved = collapse.points_after - BEFORE_FROM_CT(pieces.mesh.points)
+    clear = np.abs(pieces.mesh.points[:, 2] - known.CENTRE[2]) > 10.0
+    for number in (0, 1):
+        mine = clear & (pieces.node_piece() == number)
+        assert mine.sum() > 10
+        assert_allclose(moved[mine], np.broadcast_to(apart[number], (mine.sum(), 3)), atol=0.4)
+    assert collapse.model.refinements[0] == whole[0]
+    assert collapse.model.refinements[1].before_mm == slid_mm
+    assert collapse.model.refinements[1].after_mm < 0.1
 
 
 def test_the_pose_moves_pieces_as_it_moved_the_whole_and_knows_what_was_seen_where() -> None:

@@ -133,6 +133,13 @@ def test_an_oblique_ellipsoid_ends_at_its_semi_axes(axis: int, sign: float) -> N
     assert in_ellipsoid(1.001 * tip, lengths, directions) is False
 
 
+@pytest.mark.parametrize(("off_mm", "told"), [(2.0, True), (2.1, None), (4.0, None), (4.1, False)])
+def test_without_directions_an_ellipsoid_is_told_within_its_least_and_beyond_its_greatest_axis(
+    off_mm: float, told: bool | None
+) -> None:
+    assert in_ellipsoid(np.array([0.0, off_mm, 0.0]), np.array([4.0, 3.0, 2.0]), None) is told
+
+
 def test_an_ellipsoid_is_smaller_than_its_box() -> None:
     lengths, directions = oblique()
     corner = lengths @ directions

@@ -16,7 +16,7 @@ from vatsloc.maps import MeshMap, covered, sampled
 from vatsloc.workflow.gates import at_least, at_most
 from vatsloc.workflow.observe import hand_placed
 from vatsloc.workflow.quality import in_view
-from vatsloc.workflow.settings import load_settings
+from vatsloc.workflow.settings import Settings, load_settings
 from vatsloc.workflow.stages import Stages
 
 AROUND = RigidTransform.about(np.array([5.0, 0.0, 0.0]), np.array([0.0, 0.1, -0.2]), np.array([3.0, -4.0, 12.0]))
@@ -138,6 +138,10 @@ def test_every_preset_has_all_parts_switched_on(preset: str) -> None:
         *("model.hilum", "model.diaphragm", "model.regional", "model.correct"),
     }
     assert all(switches.values())
+
+
+def test_what_a_settings_file_leaves_out_lies_within_the_bounds_of_what_it_may_say() -> None:
+    assert Settings.model_validate(Settings().model_dump()) == Settings()
 
 
 def test_hand_placed_points_look_away_from_the_lung() -> None:
