@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from vatsloc import synthetic
 from vatsloc.cli import main
-from vatsloc.errors import CaseError
+from vatsloc.errors import CaseError, InputRefused
 from vatsloc.phantom_command import phantom, subcommand_of
 from vatsloc.study.cohort import contact_sheet, suite
 from vatsloc.synthetic import case, series
@@ -142,3 +143,16 @@ def test_a_case_beside_the_sheet_needs_the_sheet(asked: list[Any], capsys: pytes
     assert code == CaseError.exit_code
     assert "give --sheet FILE too" in said
     assert asked == []
+
+
+def test_a_scan_that_no_twin_can_be_made_of_is_refused_with_its_name(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def refuse(*_given: Any) -> None:
+        raise ValueError("the lung has no place for a nodule")
+
+    monkeypatch.setattr(case, "read_scan", lambda *_given: SimpleNamespace(nodule=None))
+    monkeypatch.setattr(case, "make_twin", refuse)
+    with pytest.raises(InputRefused, match=r"scan\.nii\.gz: the lung has no place for a nodule, or give the mask"):
+        case.write_twin(Path("scan.nii.gz"), "left", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
