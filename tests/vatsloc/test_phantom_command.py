@@ -93,6 +93,12 @@ def test_the_suite_s_sheet_shows_its_cases_beside_another(asked: list[Any], caps
     assert asked == [("write_suite", Path("d"), 2, say, "projection"), sheet]
 
 
+def test_a_sheet_is_drawn_of_any_cases(asked: list[Any], capsys: pytest.CaptureFixture[str]) -> None:
+    code, out, _ = run(capsys, "sheet a b --out s.jpg --columns 1")
+    assert (code, out) == (0, "s.jpg\n")
+    assert asked == [("write_sheet", [Path("a"), Path("b")], Path("s.jpg"), 1)]
+
+
 @pytest.mark.parametrize(
     ("words", "use", "sentence"),
     [
@@ -134,8 +140,9 @@ def test_the_help_lists_every_use(words: str, capsys: pytest.CaptureFixture[str]
     assert code == (0 if words else CaseError.exit_code)
     uses = [command.name for command in phantom.registered_commands]
     assert all(f" {use} " in out for use in uses)
-    assert uses == ["case", "suite", "twin", "breath"]
-    assert {subcommand_of(line) for line in (["x"], ["--suite"], ["--from-ct"], ["--series=1"])} == set(uses)
+    assert uses == ["case", "suite", "sheet", "twin", "breath"]
+    told = {subcommand_of(line) for line in (["x"], ["--suite"], ["--from-ct"], ["--series=1"])}
+    assert told == set(uses) - {"sheet"}
 
 
 def test_a_case_beside_the_sheet_needs_the_sheet(asked: list[Any], capsys: pytest.CaptureFixture[str]) -> None:
