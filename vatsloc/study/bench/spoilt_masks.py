@@ -113,6 +113,6 @@ def _balls(inside: Array, grid: Grid, centres: Array, radii_mm: Array) -> Array:
         box = tuple(
             slice(max(c - r, 0), min(c + r + 1, n)) for c, r, n in zip(centre, reach, inside.shape, strict=True)
         )
-        at = np.stack(np.mgrid[box], axis=-1)
+        at = np.moveaxis(np.asarray(np.mgrid[box]), 0, -1)
         found[box] |= np.linalg.norm((at - centre) * grid.spacing, axis=-1) <= radius
     return found
