@@ -70,10 +70,12 @@ def test_what_is_made_of_spoilt_masks_is_told(monkeypatch: pytest.MonkeyPatch, t
         if way == "parts missing":
             raise InputRefused("too little is left")
         lung = SimpleNamespace(side="left", expired=SimpleNamespace(volumes=np.array([2e6])))
-        return SimpleNamespace(lungs=[lung], marks=lambda _side: None, notes=() if way is None else (f"{way} mended.",))
+        notes = () if way is None else (f"{way} mended.",)
+        pair = SimpleNamespace(side="left", lung=lung)
+        return SimpleNamespace(lungs=[lung], pairs=[pair], marks=lambda _side: None, notes=notes)
 
     monkeypatch.setattr(bench, "read_person", read)
-    monkeypatch.setitem(bench.ROWS, bench.BREATHING, lambda _lung: np.zeros((1, 3)))
+    monkeypatch.setattr(bench, "predicted", lambda _name, _pair: np.zeros((1, 3)))
     monkeypatch.setattr(bench, "errors", lambda *_given: (np.array([1.0, 3.0]), np.array([0.0])))
     rows = bench.spoilt_masks(tmp_path)
     assert [row["masks"] for row in rows] == ["as they come", *SPOILT]
