@@ -289,7 +289,10 @@ def place_nodule(
     }[lesion.place]
     apt &= level & (sign * points[:, 0] > inner)
     if not apt.any():
-        raise ValueError(f"no place {lesion.depth:g} mm below the pleura, choose a nodule depth between 6 and 45 mm")
+        raise ValueError(
+            f"the lung has no place for a nodule {lesion.depth:g} mm below the pleura in its {lesion.place}, "
+            f"its deepest tissue lies {-lung.values.min():.0f} mm below; take a lung that holds air"
+        )
     return points[apt][rng.integers(int(apt.sum()))] + rng.uniform(-1, 1, 3)
 
 

@@ -1,4 +1,5 @@
-"""Command `vatsloc phantom`: one synthetic case, the whole suite, or the twin of a scan, collapsed or breathing.
+"""Command `vatsloc phantom`: one synthetic case, the whole suite, or the twin of a scan, collapsed or breathing; and a
+picture of cases side by side.
 
 Each use is a subcommand with its own options. Which one is meant shows in the options, so its name need not be given.
 """
@@ -40,9 +41,10 @@ def subcommand_of(args: list[str]) -> str:
 phantom = typer.Typer(
     cls=ByOption,
     no_args_is_help=True,
-    help="Write a synthetic case with known truth, the whole suite, or the twin of a scan, collapsed or breathing.",
+    help="Write a synthetic case with known truth, the whole suite, or the twin of a scan, collapsed or breathing; "
+    "or draw cases side by side.",
     epilog="The subcommand's name may be left out: phantom NAME --out CASE; phantom --suite DIR; "
-    "phantom --from-ct FILE --out CASE; phantom --from-ct FILE --series N --out DIR.",
+    "phantom --from-ct FILE --out CASE; phantom --from-ct FILE --series N --out DIR. Not that of sheet.",
 )
 
 SeedOption = Annotated[int, typer.Option("--seed", metavar="N", help="Seed of the anatomy.")]
@@ -90,6 +92,19 @@ def make_suite(
     if sheet is not None:
         write_sheet([suite / case for case in made], sheet, beside=beside)
     print(table(made))
+
+
+@phantom.command("sheet")
+def make_sheet(
+    cases: Annotated[list[Path], typer.Argument(metavar="CASES...", help="Case folders with true nodules.")],
+    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="Picture to write, PNG or JPEG.")],
+    columns: Annotated[int, typer.Option(metavar="N", min=1, help="Cases beside each other.")] = 2,
+) -> None:
+    """Draw cases side by side in one window of HU: phantoms, or twins of scans beside them."""
+    from vatsloc.study.cohort.contact_sheet import write_sheet
+
+    write_sheet(cases, out, columns)
+    print(out)
 
 
 @phantom.command("twin")

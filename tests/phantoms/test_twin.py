@@ -135,3 +135,12 @@ def test_breath_of_a_scan_without_a_lung_is_refused(scan: Scan) -> None:
     empty = Region(np.zeros(scan.ct.hu.shape, dtype=bool), scan.ct.ras_from_ijk)
     with pytest.raises(ValueError, match="too little of the left lung"):
         make_breath(replace(scan, lungs=scan.lungs | {"left": empty}), "right", 10, 0.8)
+
+
+def test_a_scan_of_a_lung_too_thin_for_a_nodule_says_how_deep_it_is(scan: Scan) -> None:
+    right = scan.lungs["right"]
+    x = right.grid.points()[..., 0]
+    thin = Region(right.inside & (x > np.percentile(x[right.inside], 60)), right.ras_from_ijk)
+    deep = replace(SPEC, lesion=Lesion(depth=45.0))
+    with pytest.raises(ValueError, match=r"no place for a nodule 45 mm below the pleura .* lies \d+ mm below"):
+        make_twin(replace(scan, lungs=scan.lungs | {"right": thin}), deep)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from vatsloc import synthetic
 from vatsloc.cli import main
-from vatsloc.errors import CaseError
+from vatsloc.errors import CaseError, InputRefused
 from vatsloc.phantom_command import phantom, subcommand_of
 from vatsloc.study.cohort import contact_sheet, suite
 from vatsloc.synthetic import case, series
@@ -92,6 +93,12 @@ def test_the_suite_s_sheet_shows_its_cases_beside_another(asked: list[Any], caps
     assert asked == [("write_suite", Path("d"), 2, say, "projection"), sheet]
 
 
+def test_a_sheet_is_drawn_of_any_cases(asked: list[Any], capsys: pytest.CaptureFixture[str]) -> None:
+    code, out, _ = run(capsys, "sheet a b --out s.jpg --columns 1")
+    assert (code, out) == (0, "s.jpg\n")
+    assert asked == [("write_sheet", [Path("a"), Path("b")], Path("s.jpg"), 1)]
+
+
 @pytest.mark.parametrize(
     ("words", "use", "sentence"),
     [
@@ -133,8 +140,9 @@ def test_the_help_lists_every_use(words: str, capsys: pytest.CaptureFixture[str]
     assert code == (0 if words else CaseError.exit_code)
     uses = [command.name for command in phantom.registered_commands]
     assert all(f" {use} " in out for use in uses)
-    assert uses == ["case", "suite", "twin", "breath"]
-    assert {subcommand_of(line) for line in (["x"], ["--suite"], ["--from-ct"], ["--series=1"])} == set(uses)
+    assert uses == ["case", "suite", "sheet", "twin", "breath"]
+    told = {subcommand_of(line) for line in (["x"], ["--suite"], ["--from-ct"], ["--series=1"])}
+    assert told == set(uses) - {"sheet"}
 
 
 def test_a_case_beside_the_sheet_needs_the_sheet(asked: list[Any], capsys: pytest.CaptureFixture[str]) -> None:
@@ -142,3 +150,16 @@ def test_a_case_beside_the_sheet_needs_the_sheet(asked: list[Any], capsys: pytes
     assert code == CaseError.exit_code
     assert "give --sheet FILE too" in said
     assert asked == []
+
+
+def test_a_scan_that_no_twin_can_be_made_of_is_refused_with_its_name(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def refuse(*_given: Any) -> None:
+        raise ValueError("the lung has no place for a nodule")
+
+    monkeypatch.setattr(case, "read_scan", lambda *_given: SimpleNamespace(nodule=None))
+    monkeypatch.setattr(case, "make_twin", refuse)
+    with pytest.raises(InputRefused, match=r"scan\.nii\.gz: the lung has no place for a nodule, or give the mask"):
+        case.write_twin(Path("scan.nii.gz"), "left", tmp_path / "out")
+    assert not (tmp_path / "out").exists()

@@ -133,6 +133,7 @@ def bench_real_command(
         typer.Argument(metavar="DIR...", help="Folders with lung masks at two breath-holds and landmark pairs."),
     ],
     picture: Annotated[Path | None, typer.Option(help="PNG of the errors as arrows; needs the extra `report`.")] = None,
+    spoil: Annotated[bool, typer.Option("--spoil", help="Also with the masks spoilt the ways that people do.")] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Real lungs: move one breath-hold into the other by shape alone; errors at landmarks that were only scored."""
@@ -142,7 +143,7 @@ def bench_real_command(
 
     if picture is not None:
         require_matplotlib()
-    result = bench_real(people, say=say)
+    result = bench_real(people, say, spoil)
     say(table(result))
     if picture is not None:
         draw_real(people, picture)

@@ -73,10 +73,16 @@ def write_twin(
     say(f"twin of {ct.name}, {side} lung, seed {seed} ...")
     scan = read_scan(ct, side, nodule)
     made_from = {"spec": json.loads(json.dumps(asdict(spec))), "seed": seed, "scan": ct.name}
+    _write_whole(lambda: _twin_or_refusal(ct, scan, spec, seed), folder, made_from, say)
+
+
+def _twin_or_refusal(ct: Path, scan: Scan, spec: PhantomSpec, seed: int) -> PhantomCase:
+    """The twin of a scan; raises InputRefused where the scan does not show what is needed."""
     try:
-        _write_whole(lambda: make_twin(scan, spec, seed), folder, made_from, say)
+        return make_twin(scan, spec, seed)
     except ValueError as refusal:
-        raise InputRefused(f"{ct}: {refusal}.") from refusal
+        more = "" if scan.nodule is not None else ", or give the mask of a nodule that it has by --nodule"
+        raise InputRefused(f"{ct}: {refusal}{more}.") from refusal
 
 
 def side_named(side: str) -> Side:

@@ -1,6 +1,6 @@
 """Keypoints inside the lung matched between both cone-beam CTs: first about where a model of the collapse puts them,
 then by propagation from the matches to their neighbours. Where these are few, the model may be far off: they are looked
-for about places to all sides of it too, and in tissue without air.
+for about places to all sides of it too, in a smaller and a larger lung, and in tissue without air.
 """
 
 from __future__ import annotations
@@ -29,6 +29,8 @@ FEW = 400
 """With fewer keypoints than this, more are looked for: in airless tissue, and one in every smaller cell."""
 SHIFT_MM = 12.0
 """How far aside of the model keypoints are then looked for, less than the reach, so that no gap is left."""
+SIZES = (0.85, 1.15)
+"""And how much smaller and larger than modelled the lung may be, along every axis."""
 VOTERS, VOTES, ALIKE_MM = 6, 2, 8.0
 """A match found there counts if so many of so many neighbours move as it does, within ALIKE_MM."""
 SHRUNK_CELL_MM = 7.0
@@ -59,11 +61,21 @@ def find_correspondences(
     found = propagate_matches(deflated, placed, after, before, first, PropagationSettings(match))
     if len(found) >= FEW:
         return found
-    for shift in SHIFT_MM * np.concatenate([np.eye(3), -np.eye(3)]):
-        first = first.joined(_near_model(prepared, observed, displacement + shift, match))
+    for other in _others(observed.model_mesh.points, displacement):
+        first = first.joined(_near_model(prepared, observed, other, match))
     found = propagate_matches(deflated, placed, after, before, _consistent(first), PropagationSettings(match))
     after, finer = _inner(tissue(prepared, observed, deflated), seen), replace(match, cell_mm=SHRUNK_CELL_MM)
     return propagate_matches(deflated, placed, after, before, found, PropagationSettings(finer))
+
+
+def _others(rest: Array, displacement: Array) -> list[Array]:
+    """Displacements (n, 3) mm of nodes at rest (n, 3) that put the collapsed lung aside of the model, or make it more or
+    less collapsed.
+    """
+    shifts = SHIFT_MM * np.concatenate([np.eye(3), -np.eye(3)])
+    after = rest + displacement
+    about = after - after.mean(axis=0)
+    return [displacement + shift for shift in shifts] + [displacement + (size - 1) * about for size in SIZES]
 
 
 def _consistent(found: Correspondences) -> Correspondences:

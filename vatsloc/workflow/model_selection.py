@@ -105,14 +105,14 @@ def select_model(
     start = CollapseModel(
         system, replace(plain, state=solid.state), solid.state.u, NO_CORRESPONDENCES, (), solid, NO_ENSEMBLE
     )
-    model, training_only = _refined(start, surface, prepared, observed, settings, stages)
+    model, training_only = refined_model(start, surface, prepared, observed, settings, stages)
     if any(refinement.kept for refinement in model.refinements):
         return replace(model, ensemble=(training_only.displacement - model.displacement)[None])
     with stages.stage("perturbation ensemble"):
         return replace(model, ensemble=perturbation_ensemble(system, surface, plain, fit_settings(settings)))
 
 
-def _refined(
+def refined_model(
     model: CollapseModel, surface: Target, prepared: Prepared, observed: Observed, settings: Settings, stages: Stages
 ) -> tuple[CollapseModel, CollapseModel]:
     """The model with the refinements that were kept, fitted to all keypoints, and the same training-only."""

@@ -103,6 +103,13 @@ def collapse(
 ) -> Collapse:
     """The part of `pneumothorax` that follows the observations."""
     model = select_model(case.gravity_ras, prepared, observed, settings, stages)
+    return modelled(prepared, pose, observed, model, settings, stages)
+
+
+def modelled(
+    prepared: Prepared, pose: ChangeOfPose, observed: Observed, model: CollapseModel, settings: Settings, stages: Stages
+) -> Collapse:
+    """The collapse as a model has it, with what the images add to it."""
     before = observed.mesh_before
     after = before.points + interpolate(locate(observed.model_mesh, before.points), model.displacement)
     residual = _residual(prepared, pose, observed, model, after, settings, stages)

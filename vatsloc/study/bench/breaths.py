@@ -17,6 +17,7 @@ from vatsloc.breathing.lungs import EDGE_MM, Pair, both_scans
 from vatsloc.errors import CaseError, InputRefused
 from vatsloc.formats.guard import reading
 from vatsloc.imaging.lungs import Side
+from vatsloc.study.bench.spoilt_masks import spoilt
 
 _COLUMNS = ["insp_x", "insp_y", "insp_z", "exp_x", "exp_y", "exp_z"]
 _OTHER_COLUMNS = ["first_x", "first_y", "first_z", "second_x", "second_y", "second_z"]
@@ -60,9 +61,9 @@ class Person:
         return Marks(self.inspired[here], self.expired[here])
 
 
-def read_person(folder: Path, edge_mm: float = EDGE_MM) -> Person:
+def read_person(folder: Path, edge_mm: float = EDGE_MM, way: str | None = None) -> Person:
     """The person of a breathing case's folder (masks, or images, of two states) with `landmarks_ras_mm.csv` (header
-    insp_x ... exp_z, RAS mm), meshed with edges of `edge_mm`.
+    insp_x ... exp_z, RAS mm), meshed with edges of `edge_mm`; way: in which its masks are spoilt first (`SPOILT`).
 
     Raises CaseError for a missing file or another header, InputRefused for masks without lungs or bad numbers.
     """
@@ -70,6 +71,7 @@ def read_person(folder: Path, edge_mm: float = EDGE_MM) -> Person:
     if case.landmarks is None:
         raise CaseError(f"{folder} lacks {LANDMARKS}; write {','.join(_COLUMNS)} in RAS mm.")
     points = _landmarks(case.landmarks)
+    case = case if way is None else spoilt(case, way)
     pairs, notes = both_scans(case, edge_mm)
     return Person(case.name, case, tuple(pairs), tuple(notes), points[:, :3], points[:, 3:])
 

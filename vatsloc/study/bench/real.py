@@ -11,17 +11,22 @@ import numpy as np
 
 from poro.arrays import Array
 from poro.breathing.affine import affine_to_points, affine_to_shape
-from poro.breathing.elastic import WALL_ALONE, Breathing, Lung, breathe_out
+from poro.breathing.elastic import WALL_ALONE, Breathing, Lung, acting_at, breathe_out
 from poro.mesh import TetMesh, interpolate, locate
+from vatsloc.breathing.lungs import Pair
+from vatsloc.errors import InputRefused
 from vatsloc.evaluation.statistics import distances, summarize
 from vatsloc.frames import Side
 from vatsloc.study.bench.breaths import Marks, read_person
 from vatsloc.study.bench.real_images import has_images, registered
 from vatsloc.study.bench.real_images import table as images_table
+from vatsloc.study.bench.spoilt_masks import SPOILT
 
 UNMOVED, CENTROID, SHAPE_AFFINE = "unmoved", "centroid of the shape", "affine map fitted to the shape"
 ELASTIC = "elastic lung that slides on its wall"
 BREATHING = "the same with weight, bronchi and ribs"
+BY_DEPTH = "these by the depth of the breath"
+"""What `vatsloc breathe` does: in a quiet breath they hardly act."""
 TRUE_AFFINE = "affine map fitted to the landmarks"
 """The last row has seen the truth: it is what a map of twelve numbers per lung can reach at best."""
 
@@ -48,18 +53,45 @@ ROWS: dict[str, Predict] = {
 """Predictions of where the inspired lung's nodes (n, 3) lie after expiration; they are given no landmark."""
 
 
-def bench_real(folders: Sequence[Path], say: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
+def predicted(name: str, pair: Pair) -> Array:
+    """Nodes (n, 3) mm of a lung after expiration by a row of `ROWS`, or by `BY_DEPTH`."""
+    return breathe_out(pair.lung, acting_at(pair.depth)) if name == BY_DEPTH else ROWS[name](pair.lung)
+
+
+def bench_real(
+    folders: Sequence[Path], say: Callable[[str], None] = lambda _: None, spoil: bool = False
+) -> dict[str, Any]:
     """Errors at the landmarks of every person, from inspiration to expiration and (`back`) the other way, per lung and
-    pooled; a case's own figures are those of the row `BREATHING`.
+    pooled; a case's own figures are those of the row `BY_DEPTH`. spoil: also with masks spoilt in each of `SPOILT`'s
+    ways (`spoilt`).
 
     Raises as `read_person`.
     """
-    return {"cases": [measure(folder, say) for folder in folders]}
+    return {"cases": [measure(f, say) | ({"spoilt": spoilt_masks(f, say)} if spoil else {}) for f in folders]}
+
+
+def spoilt_masks(folder: Path, say: Callable[[str], None] = lambda _: None) -> list[dict[str, Any]]:
+    """What the row `BY_DEPTH` makes of masks as they come and as people spoil them: its errors on the way out, volume
+    of the mended expired lungs over that of the unspoilt ones, and what was mended; or why it was refused."""
+    rows: list[dict[str, Any]] = []
+    for way in (None, *SPOILT):
+        name = way or "as they come"
+        say(f"{folder.name}, masks {name} ...")
+        try:
+            person = read_person(folder, way=way)
+        except InputRefused as refusal:
+            rows.append({"masks": name, "refused": str(refusal)})
+            continue
+        parts = [errors(p.lung, predicted(BY_DEPTH, p), person.marks(p.side))[0] for p in person.pairs]
+        volume = sum(float(g.expired.volumes.sum()) for g in person.lungs) / 1e3
+        rows.append({"masks": name, "expired_ml": volume, "lungs": len(parts), "notes": list(person.notes)})
+        rows[-1] |= _statistics(np.concatenate(parts))
+    return rows
 
 
 def measure(folder: Path, say: Callable[[str], None]) -> dict[str, Any]:
     """All rows of one person, both ways, and figures of registration (`images`, by side) where there are images.
-    seconds: reading, meshing and the row `BREATHING`."""
+    seconds: reading, meshing and the row `BY_DEPTH`."""
     began = perf_counter()
     say(f"{folder.name}: reading and meshing ...")
     person = read_person(folder)
@@ -71,11 +103,11 @@ def measure(folder: Path, say: Callable[[str], None]) -> dict[str, Any]:
     out: dict[str, Any] = {}
     back: dict[str, Any] = {}
     seconds = perf_counter() - began
-    for name, predict in ROWS.items():
+    for name in (*ROWS, BY_DEPTH):
         say(f"{person.name}: {name} ...")
         began = perf_counter()
-        moved = [predict(lung) for lung in lungs]
-        if name == BREATHING:
+        moved = [predicted(name, pair) for pair in person.pairs]
+        if name == BY_DEPTH:
             seconds += perf_counter() - began
         for lung, there in zip(lungs, moved, strict=True):
             nodes[lung.side][name] = there
@@ -117,11 +149,28 @@ def table(result: dict[str, Any]) -> str:
                 lines.append(f"  {name:40s}" + "".join(f"{cell:>22s}" for cell in cells))
         for side, found in (case["images"] or {}).items():
             lines += images_table(case["name"], side, found)
+        lines += _spoilt_table(case["name"], case.get("spoilt", ()))
     return "\n".join(lines)
 
 
+def _spoilt_table(name: str, rows: Sequence[dict[str, Any]]) -> list[str]:
+    """Lines of text about spoilt masks; none where they were not asked for."""
+    if not rows:
+        return []
+    lines = [f"{name}, masks spoilt: lungs, ml of them expired, mean / 95 % / maximum in mm at the landmarks"]
+    for row in rows:
+        if "refused" in row:
+            lines.append(f"  {row['masks']:22s} refused: {row['refused']}")
+            continue
+        cell = f"{row['mean']:.2f} / {row['p95']:.1f} / {row['max']:.1f}"
+        lines.append(
+            f"  {row['masks']:22s}{row['lungs']:3d}{row['expired_ml']:8.0f}{cell:>22s}  {' '.join(row['notes'])}"
+        )
+    return lines
+
+
 def _way(direction: str, rows: dict[str, Any]) -> dict[str, Any]:
-    best = rows[BREATHING]["both"]
+    best = rows[BY_DEPTH]["both"]
     figures = {key: best[key] for key in ("mean", "p95", "max")}
     return {"direction": direction, "initial_mean": rows[UNMOVED]["both"]["mean"], **figures, "rows": rows}
 

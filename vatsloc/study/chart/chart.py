@@ -12,16 +12,18 @@ from typing import Any
 import numpy as np
 
 from poro.fit import FitStatus
-from registration.maps.rigid import RigidTransform
+from poro.mesh import stuff
 from registration.volume import Array
 from vatsloc.case import Case, read_case
 from vatsloc.errors import InputRefused, NotConverged, VatslocError
-from vatsloc.evaluation.inputs import Truth, read_truth
-from vatsloc.evaluation.statistics import summarize
+from vatsloc.evaluation.inputs import Truth, depth_below_pleura, read_truth, seen_in
+from vatsloc.evaluation.statistics import distances, summarize
 from vatsloc.evaluation.tre import RunMaps, target_registration_errors
 from vatsloc.study.chart.variants import Scored, Variant
 from vatsloc.study.cohort.scored import run_maps
-from vatsloc.workflow.pneumothorax import pneumothorax
+from vatsloc.workflow.observe import observe
+from vatsloc.workflow.parted import in_pieces
+from vatsloc.workflow.pneumothorax import Collapse, modelled, pneumothorax, refined
 from vatsloc.workflow.pose import ChangeOfPose, change_of_pose
 from vatsloc.workflow.prepare import Prepared, prepare
 from vatsloc.workflow.settings import load_settings
@@ -29,15 +31,21 @@ from vatsloc.workflow.stages import Say, Stages, quiet
 
 RUNS = "runs.csv"
 PHASES = ("phase1", "phase2", "chain")
+PLEURA_MM = 10.0
+"""Tissue nearer to the pleura than this has a panel of its own: most nodules that need localizing lie there."""
+DEPTH_EDGE_MM = 8.0
+"""Tetrahedra of the lung that depths are taken from, as those of a run."""
 SPINES = {"phase1": "spine CT to inflated", "phase2": "spine inflated to deflated"}
 NAN = float("nan")
 
 
 @dataclass(frozen=True)
 class Row:
-    """One variant on one case. *_mean, *_p95: target registration errors, mm; *_seconds: of what the phase needs, the
-    chain's from the images on disk to the nodule's place; *_cpu: the same as processor seconds, which other programs
-    disturb less; load: processes that ran on the machine at its end; failed: why there is no number.
+    """One variant on one case. *_mean, *_p95: target registration errors, mm; *_seconds: of a phase's own stages, the
+    chain's from the images on disk to the nodule's place, reading and preparation included; *_cpu: the same as
+    processor seconds, which other programs disturb less; tissue_*, pleura_*: errors of the chain at tissue that both
+    cone-beam CTs show, everywhere and within `PLEURA_MM` of the pleura; left_out: parts that the scene did not need;
+    load: processes that ran on the machine at its end; failed: why there is no number.
     """
 
     variant: str
@@ -54,7 +62,12 @@ class Row:
     chain_p95: float = NAN
     chain_seconds: float = NAN
     chain_cpu: float = NAN
+    tissue_mean: float = NAN
+    tissue_p95: float = NAN
+    pleura_mean: float = NAN
+    pleura_p95: float = NAN
     nodule_mm: float = NAN
+    left_out: str = ""
     load: float = NAN
     failed: str = ""
 
@@ -77,7 +90,7 @@ def run_chart(cases: Sequence[Path], variants: Mapping[str, Variant], out: Path,
             append_row(out / RUNS, row)
             say(
                 f"{name}, {row.variant}: "
-                + (row.failed or f"phase 1 {row.phase1_mean:.2f}, chain {row.chain_mean:.2f} mm")
+                + (row.failed or f"phase 1 {row.phase1_mean:.2f}, chain {row.chain_mean:.2f} mm, {row.chain_cpu:.0f} s")
             )
     return read_rows(out / RUNS)
 
@@ -112,23 +125,25 @@ class _Cost:
 
 @dataclass
 class _CaseRuns:
-    """A case whose images are read and prepared once; what that took counts for every variant."""
+    """A case whose images are read and prepared once; what that took counts for every variant's chain. depth_mm: (n,)
+    of the dense truth's points below the pleura."""
 
     case: Case
     truth: Truth
     prepared: Prepared
+    depth_mm: Array
     cost: _Cost
-    poses: dict[str, tuple[ChangeOfPose, _Cost]] = field(default_factory=dict)
+    poses: dict[str, tuple[ChangeOfPose, Stages]] = field(default_factory=dict)
 
-    def pose(self, variant: Variant) -> tuple[ChangeOfPose, _Cost]:
-        """Phase 1 and its cost; the same one is not run again."""
+    def pose(self, variant: Variant) -> tuple[ChangeOfPose, Stages]:
+        """Phase 1 and its log; the same one is not run again."""
         settings = variant.settings
-        left_out = settings.leave_out.first_registration_mm
-        key = f"{variant.register.__name__} {settings.registration} {settings.mesh.edge_mm} {left_out}"
+        shaped_by = settings.registration, settings.refinement, settings.mesh.edge_mm, settings.leave_out
+        key = f"{variant.register.__name__} {shaped_by}"
         if key not in self.poses:
             stages = Stages()
             found = change_of_pose(self.case, self.prepared, settings, stages, variant.register)
-            self.poses[key] = found, _Cost.of(stages)
+            self.poses[key] = found, stages
         return self.poses[key]
 
 
@@ -137,8 +152,8 @@ def measure_case(folder: Path, variants: Mapping[str, Variant]) -> Iterator[Row]
     stages = Stages()
     with stages.stage("read"):
         case = read_case(folder)
-    prepared = prepare(case, stages)
-    runs = _CaseRuns(case, read_truth(folder), prepared, _Cost.of(stages))
+    prepared, truth = prepare(case, stages), read_truth(folder)
+    runs = _CaseRuns(case, truth, prepared, _depth(prepared, truth), _Cost.of(stages))
     for name, variant in variants.items():
         row = Row(name, folder.resolve().name)
         try:
@@ -148,21 +163,42 @@ def measure_case(folder: Path, variants: Mapping[str, Variant]) -> Iterator[Row]
         yield replace(row, load=os.getloadavg()[0])
 
 
+def _depth(prepared: Prepared, truth: Truth) -> Array:
+    """Depth (n,) mm of the dense truth's points below the pleura, the same for every variant."""
+    if truth.dense is None:
+        return np.zeros(0)
+    lung = prepared.lung_ct
+    return depth_below_pleura(stuff(lung.inside, lung.ras_from_ijk, DEPTH_EDGE_MM), truth.dense[:, 0])
+
+
 def _run(runs: _CaseRuns, variant: Variant, row: Row) -> Row:
-    pose, pose_cost = runs.pose(variant)
-    phase1 = runs.cost + pose_cost
-    rigid = pose.inf_from_ct_rigid
+    pose, before = runs.pose(variant)
+    phase1, rigid = _Cost.of(before), pose.inf_from_ct_rigid
     if variant.scored is Scored.POSE:
         maps = RunMaps(rigid, rigid, rigid, pose.inf_from_ct, rigid, rigid)
+        row = replace(row, left_out=_left_out(before))
         return replace(_scored(runs.truth, maps, row, ("phase1",)), **phase1.named("phase1"))
     stages = Stages()
-    collapse = pneumothorax(runs.case, runs.prepared, pose, variant.settings, stages)
+    pose, collapse = _collapse(runs, variant, pose, stages)
     if collapse.fit.status is FitStatus.CONTACT:
         raise NotConverged("the contact of the collapsing lung did not settle")
     maps = run_maps(pose, collapse)
-    nodule = maps.def_from_inf(pose.inf_from_ct(runs.case.nodule.centre_ras[None]))
-    row = _spent(replace(row, nodule_mm=_off(nodule, runs.truth)), phase1, _Cost.of(stages))
-    return _scored(runs.truth, maps, row, PHASES)
+    row = replace(row, left_out=_left_out(before, stages))
+    return _told(runs, maps, row, phase1, _Cost.of(stages))
+
+
+def _collapse(runs: _CaseRuns, variant: Variant, pose: ChangeOfPose, stages: Stages) -> tuple[ChangeOfPose, Collapse]:
+    """What follows the change of pose, as `localize` does it but for what the variant changes."""
+    settings = variant.settings
+    observed = observe(runs.case, runs.prepared, pose, settings, stages)
+    with stages.named():
+        model = variant.select(runs.case.gravity_ras, runs.prepared, observed, settings, stages)
+        collapse = modelled(runs.prepared, pose, observed, model, settings, stages)
+        if variant.pieces:
+            pose, collapse = in_pieces(runs.prepared, pose, collapse, settings, stages)
+        if variant.blocks:
+            collapse = refined(runs.case, runs.prepared, pose, collapse, settings, stages)
+    return pose, collapse
 
 
 def _spines(runs: _CaseRuns, variant: Variant, row: Row) -> Row:
@@ -170,14 +206,36 @@ def _spines(runs: _CaseRuns, variant: Variant, row: Row) -> Row:
     stages = Stages()
     pose = change_of_pose(runs.case, runs.prepared, variant.settings, stages, variant.register)
     rigid = pose.inf_from_ct_rigid
-    collapse = pneumothorax(runs.case, runs.prepared, pose, variant.settings, stages)
+    def_from_inf = observe(runs.case, runs.prepared, pose, variant.settings, stages).def_from_inf_rigid
     there, back = (_Cost.of(stages, SPINES[phase]) for phase in ("phase1", "phase2"))
-    def_from_inf: RigidTransform = collapse.def_from_inf_rigid
     chain = def_from_inf @ rigid
-    maps = RunMaps(rigid, chain, def_from_inf, rigid, def_from_inf, chain)
-    nodule = chain(runs.case.nodule.centre_ras[None])
-    row = _spent(replace(row, nodule_mm=_off(nodule, runs.truth)), runs.cost + there, back)
-    return _scored(runs.truth, maps, row, PHASES)
+    return _told(runs, RunMaps(rigid, chain, def_from_inf, rigid, def_from_inf, chain), row, there, back)
+
+
+def _told(runs: _CaseRuns, maps: RunMaps, row: Row, phase1: _Cost, phase2: _Cost) -> Row:
+    """The row with errors at landmarks, tissue and nodule, and what both phases took."""
+    nodule = maps.def_from_ct(runs.case.nodule.centre_ras[None])
+    row = replace(row, nodule_mm=_off(nodule, runs.truth), **_tissue(runs, maps))
+    row = replace(row, **phase1.named("phase1"), **phase2.named("phase2"))
+    return _scored(runs.truth, maps, replace(row, **(runs.cost + phase1 + phase2).named("chain")), PHASES)
+
+
+def _tissue(runs: _CaseRuns, maps: RunMaps) -> dict[str, Any]:
+    """Errors of the chain at tissue that both cone-beam CTs show; empty without dense truth."""
+    truth = runs.truth
+    if truth.dense is None:
+        return {}
+    ct, places = truth.dense[:, 0], {"inflated": truth.dense[:, 1], "deflated": truth.dense[:, 2]}
+    seen = np.logical_and.reduce([seen_in(field, places[image]) for image, field in truth.fields_of_view.items()])
+    errors = distances(maps.def_from_ct(ct), places["deflated"])
+    near = seen & (runs.depth_mm < PLEURA_MM)
+    found = {"tissue": summarize(errors[seen]), "pleura": summarize(errors[near])}
+    return {f"{name}_{what}": getattr(s, what) for name, s in found.items() for what in ("mean", "p95")}
+
+
+def _left_out(*logs: Stages) -> str:
+    """Parts that the scene did not need, by name."""
+    return ", ".join(choice.part for log in logs for choice in log.choices if not choice.kept)
 
 
 def _scored(truth: Truth, maps: RunMaps, row: Row, phases: Sequence[str]) -> Row:
@@ -186,10 +244,6 @@ def _scored(truth: Truth, maps: RunMaps, row: Row, phases: Sequence[str]) -> Row
     return replace(
         row, **{f"{phase}_{what}": getattr(s, what) for phase, s in found.items() for what in ("mean", "p95")}
     )
-
-
-def _spent(row: Row, phase1: _Cost, phase2: _Cost) -> Row:
-    return replace(row, **phase1.named("phase1"), **phase2.named("phase2"), **(phase1 + phase2).named("chain"))
 
 
 def _off(predicted: Array, truth: Truth) -> float:
@@ -215,7 +269,7 @@ def read_rows(path: Path) -> list[Row]:
         table = csv.DictReader(file)
         if table.fieldnames != [f.name for f in fields(Row)]:
             raise InputRefused(f"{path} is not a table of this version's chart; give another --out.")
-        texts = ("variant", "case", "failed")
+        texts = ("variant", "case", "left_out", "failed")
         try:
             return [_row({k: v if k in texts else float(v or "nan") for k, v in line.items()}) for line in table]
         except (TypeError, ValueError) as error:

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from statistics import fmean, median
 
-from vatsloc.study.chart.chart import PHASES, Row
+from vatsloc.study.chart.chart import Row
 from vatsloc.study.chart.variants import PANELS, Variant
 from vatsloc.workflow.settings import PRESETS
 
@@ -15,16 +15,20 @@ PHASE_TITLES = {
     "phase1": "Phase 1: CT to inflated",
     "phase2": "Phase 2: inflated to deflated",
     "chain": "Whole chain: CT to deflated",
+    "pleura": "Whole chain, within 10 mm of the pleura",
 }
+COST_OF = {"pleura": "chain"}
+"""Whose seconds a panel shows, where they are not its own."""
 MEASURES = {"mean": "mean", "p95": "95 %"}
 
 
 @dataclass(frozen=True)
 class Point:
-    """A variant in one panel. mean, p95: target registration errors in mm, averaged over cases; seconds: their median
-    by the chosen clock; n: cases with an answer; front: measures for which no other point is both faster and better."""
+    """A variant in one panel. number: in the key; mean, p95: errors in mm, averaged over cases; seconds: their median
+    by a clock; n: cases with an answer; front: measures for which no other point is both faster and better."""
 
     variant: str
+    number: int
     says: str
     phase: str
     mean: float
@@ -52,31 +56,47 @@ PUBLISHED = (
 """Means over the landmarks of real patients; ours are simulated images. Ref: Alvarez 2021, section 8."""
 
 
-CLOCKS = {"seconds": "seconds, kernels compiled", "cpu": "processor seconds of all threads, kernels compiled"}
+CLOCKS = {"seconds": "seconds", "cpu": "processor seconds of all threads"}
+COUNTED = {
+    "phase1": "of the phase, without reading and preparing the images",
+    "phase2": "of the phase, without reading and preparing the images",
+    "chain": "from the images on disk",
+    "pleura": "from the images on disk",
+}
+"""What a panel's seconds count. Reading and preparing is the same for every variant, so a front is one without it."""
 
 
 def points_of(
     rows: Sequence[Row], variants: Mapping[str, Variant], clock: str = "seconds", case: str | None = None
 ) -> list[Point]:
     """A point per variant and panel that shows it, of all cases or of one; fronts hold complete points alone."""
-    rows = [row for row in rows if case in (None, row.case) and row.variant in variants]
+    rows = [row for row in rows if row.variant in variants]
+    number = numbers(rows, variants)
+    rows = [row for row in rows if case in (None, row.case)]
     cases = {row.case for row in rows}
     found = []
-    for phase in PHASES:
+    for phase in PHASE_TITLES:
         panel = []
         for name, variant in variants.items():
             if phase not in PANELS[variant.scored]:
                 continue
             own = [row for row in rows if row.variant == name]
-            values = [[getattr(row, f"{phase}_{what}") for row in own] for what in ("mean", "p95", clock)]
+            columns = (f"{phase}_mean", f"{phase}_p95", f"{COST_OF.get(phase, phase)}_{clock}")
+            values = [[getattr(row, column) for row in own] for column in columns]
             good = [triple for triple in zip(*values, strict=True) if all(map(math.isfinite, triple))]
             if good:
                 mean, p95, seconds = zip(*good, strict=True)
                 n = len(good)
                 triple = fmean(mean), fmean(p95), median(seconds)
-                panel.append(Point(name, variant.says, phase, *triple, n, n == len(cases)))
+                panel.append(Point(name, number[name], variant.says, phase, *triple, n, n == len(cases)))
         found += with_fronts(panel)
     return found
+
+
+def numbers(rows: Sequence[Row], variants: Mapping[str, Variant]) -> dict[str, int]:
+    """Numbers of the variants that were run, from 1, in the order of `variants`."""
+    ran = {row.variant for row in rows}
+    return {name: n for n, name in enumerate((name for name in variants if name in ran), 1)}
 
 
 def with_fronts(panel: Sequence[Point]) -> list[Point]:

@@ -18,6 +18,8 @@ from registration.terms.gauss_newton import Stop
 from registration.volume import Volume
 from vatsloc.errors import CaseError
 from vatsloc.study.bench.elastix import ElastixSettings, run_elastix
+from vatsloc.study.chart.without_model import Select, elastic_lung, smooth_spline
+from vatsloc.workflow.model_selection import select_model
 from vatsloc.workflow.pose import Register
 from vatsloc.workflow.settings import PRESETS, Settings, settings_of
 
@@ -34,23 +36,28 @@ class Scored(Enum):
 
 
 PANELS = {
-    Scored.SPINES: ("phase1", "phase2", "chain"),
+    Scored.SPINES: ("phase1", "phase2", "chain", "pleura"),
     Scored.POSE: ("phase1",),
-    Scored.COLLAPSE: ("phase2", "chain"),
-    Scored.ALL: ("phase1", "phase2", "chain"),
+    Scored.COLLAPSE: ("phase2", "chain", "pleura"),
+    Scored.ALL: ("phase1", "phase2", "chain", "pleura"),
 }
 """Panels of the chart that show a variant."""
 
 
 @dataclass(frozen=True)
 class Variant:
-    """says: what it is, for the reader; over: settings that differ from the preset's; register: of phase 1."""
+    """says: what it is, for the reader; over: settings that differ from the preset's; register: of phase 1; select: the
+    model of phase 2; blocks: whether the collapsed lung follows small blocks of the CT; pieces: whether it may be cut.
+    """
 
     says: str
     scored: Scored
     over: Mapping[str, Any] = field(default_factory=dict)
     preset: str = "balanced"
     register: Register = register_sliding
+    select: Select = select_model
+    blocks: bool = True
+    pieces: bool = True
 
     @property
     def settings(self) -> Settings:
@@ -92,12 +99,13 @@ def _ffd(says: str, register: Register = register_sliding, **over: float) -> Var
 
 
 def _model(
-    says: str, residual: bool = True, edge_mm: float | None = None, keypoints: bool = True, **over: Any
+    says: str, images: bool = True, edge_mm: float | None = None, keypoints: bool = True, **over: Any
 ) -> Variant:
-    changed: dict[str, Any] = {"model": over, "residual": {"on": residual}, "keypoints": {"on": keypoints}}
+    """images: whether residual registration and block refinement follow the model."""
+    changed: dict[str, Any] = {"model": over, "residual": {"on": images}, "keypoints": {"on": keypoints}}
     if edge_mm is not None:
         changed["mesh"] = {"model_edge_mm": edge_mm}
-    return Variant(says, Scored.COLLAPSE, changed)
+    return Variant(says, Scored.COLLAPSE, changed, blocks=images)
 
 
 def _solid(edge_mm: float, finite: bool) -> Variant:
@@ -108,11 +116,14 @@ def _solid(edge_mm: float, finite: bool) -> Variant:
         says,
         Scored.COLLAPSE,
         {"mesh": {"model_edge_mm": edge_mm}, "leave_out": strained, "residual": _OFF, "keypoints": _OFF},
+        blocks=False,
     )
 
 
 # What is left on is not scored; the pose needs none of it.
 _SPINE_ALONE = {"registration": _OFF, "residual": _OFF, "keypoints": _OFF, "model": {"max_steps": 1}}
+_MODEL_ALONE = "without images"
+"""Neither residual registration nor blocks follow."""
 
 VARIANTS: dict[str, Variant] = {
     "rigid": Variant("spine alone, in both phases", Scored.SPINES, _SPINE_ALONE),
@@ -120,43 +131,57 @@ VARIANTS: dict[str, Variant] = {
     "affine": _ffd("affine map of the lung after the spine", grid_mm=64.0, levels=1, bending=1e6),
     "ffd-32": _ffd("free form, 32 mm grid", grid_mm=32.0, levels=3),
     "ffd-16": _ffd("free form, 16 mm grid", grid_mm=16.0, levels=4),
-    "ffd-8": _ffd("free form, 8 mm grid"),
     "ffd-plain": _ffd("free form of everything seen", plain),
     "ffd-masked": _ffd("free form of masked lungs, as in the paper", masked_only),
     "voxel-1": _ffd("free form, voxels of 1 mm", voxel_mm=1.0),
     "voxel-1.5": _ffd("free form, voxels of 1.5 mm", voxel_mm=1.5),
     "voxel-3": _ffd("free form, voxels of 3 mm", voxel_mm=3.0),
     "no-first": Variant(
-        "free form, 16 mm grid, without its first registration",
+        "phase 1 without its first registration",
         Scored.POSE,
         {"leave_out": {"first_registration_mm": inf}},
     ),
     "elastix": _ffd("itk-elastix, 16 mm grid", elastix),
-    "no-pose": Variant("no change of pose", Scored.COLLAPSE, {"registration": {"on": False}}),
+    "no-pose": Variant("no change of pose", Scored.COLLAPSE, {"registration": _OFF}),
     "tetrahedra-12": _model("model of 12 mm tetrahedra", edge_mm=12.0),
     "tetrahedra-8": _model("model of 8 mm tetrahedra", edge_mm=8.0),
     "tetrahedra-5": _model("model of 5 mm tetrahedra", edge_mm=5.0),
-    "alone": _model("model without residual registration", residual=False),
-    "alone-8": _model("model of 8 mm tetrahedra without residual registration", residual=False, edge_mm=8.0),
+    "alone": _model(f"model {_MODEL_ALONE}", images=False),
+    "alone-8": _model(f"model of 8 mm tetrahedra {_MODEL_ALONE}", images=False, edge_mm=8.0),
+    "elastic": Variant("no model: an elastic lung follows surface and keypoints", Scored.COLLAPSE, select=elastic_lung),
+    "spline": Variant("no model: a smooth map through surface and keypoints", Scored.COLLAPSE, select=smooth_spline),
+    "elastic-alone": Variant(
+        f"no model: an elastic lung {_MODEL_ALONE}",
+        Scored.COLLAPSE,
+        {"residual": _OFF},
+        select=elastic_lung,
+        blocks=False,
+    ),
+    "spline-alone": Variant(
+        f"no model: a smooth map {_MODEL_ALONE}",
+        Scored.COLLAPSE,
+        {"residual": _OFF},
+        select=smooth_spline,
+        blocks=False,
+    ),
     "regional-alone": _model(
-        "model with regional parameters, not corrected, without residual registration", residual=False, correct=False
+        f"model with regional parameters, not corrected, {_MODEL_ALONE}", images=False, correct=False
     ),
     "no-keypoints": _model("model fitted to the surface alone", keypoints=False),
-    "no-keypoints-alone": _model(
-        "model fitted to the surface alone, without residual registration", residual=False, keypoints=False
-    ),
+    "no-keypoints-alone": _model(f"model fitted to the surface alone, {_MODEL_ALONE}", images=False, keypoints=False),
     "no-regional": _model("no regional parameters", regional=False),
     "no-correction": _model("no elastic correction", correct=False),
+    "no-residual": Variant("no residual registration", Scored.COLLAPSE, {"residual": _OFF}),
+    "no-blocks": Variant("no block refinement, in both phases", Scored.ALL, {"refinement": _OFF}),
+    "one-piece": Variant("never cut into pieces", Scored.COLLAPSE, pieces=False),
     "paper-cost": _model("the paper's cost", cost="plain"),
     "paper-cost-alone": _model(
-        "the paper's cost and parameters, without residual registration", residual=False, keypoints=False, cost="plain"
+        f"the paper's cost and parameters, {_MODEL_ALONE}", images=False, keypoints=False, cost="plain"
     ),
     "no-hilum": _model("hilum not tracked", hilum=False),
-    "no-hilum-alone": _model("hilum not tracked, without residual registration", residual=False, hilum=False),
+    "no-hilum-alone": _model(f"hilum not tracked, {_MODEL_ALONE}", images=False, hilum=False),
     "no-diaphragm": _model("diaphragm held still", diaphragm=False),
-    "no-diaphragm-alone": _model(
-        "diaphragm held still, without residual registration", residual=False, diaphragm=False
-    ),
+    "no-diaphragm-alone": _model(f"diaphragm held still, {_MODEL_ALONE}", images=False, diaphragm=False),
     **{f"linear-{edge}": _solid(edge, finite=False) for edge in (12, 8, 5)},
     **{f"finite-{edge}": _solid(edge, finite=True) for edge in (12, 8, 5)},
     **{name: Variant(f"preset {name}", Scored.ALL, preset=name) for name in PRESETS},

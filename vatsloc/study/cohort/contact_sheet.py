@@ -24,11 +24,12 @@ _PANELS = (
     ("cbct_inflated.nii.gz", "truth/nodule_cbct_inflated.mrk.json", "coronal"),
     ("cbct_deflated.nii.gz", "truth/nodule_cbct_deflated.mrk.json", "coronal"),
     ("cbct_deflated.nii.gz", "truth/nodule_cbct_deflated.mrk.json", "sagittal"),
+    ("cbct_deflated.nii.gz", "truth/nodule_cbct_deflated.mrk.json", "axial"),
 )
 
 
 def write_sheet(cases: Sequence[Path], out: Path, columns: int = 2, beside: Path | None = None) -> None:
-    """Write a PNG or JPEG with a row of five cuts for every case folder, `columns` cases beside each other.
+    """Write a PNG or JPEG with a row of six cuts for every case folder, `columns` cases beside each other.
 
     beside: a case made from a real scan, shown first. Raises CaseError where the picture cannot be written so.
     """
@@ -40,7 +41,8 @@ def write_sheet(cases: Sequence[Path], out: Path, columns: int = 2, beside: Path
     strips = [np.pad(s, ((0, 0), (0, width - s.shape[1]))) for s in strips]
     strips += [np.zeros_like(strips[0])] * (-len(strips) % columns)
     rows = [np.hstack(strips[n : n + columns]) for n in range(0, len(strips), columns)]
-    if not cv2.imwrite(str(out), np.vstack(rows), [cv2.IMWRITE_JPEG_QUALITY, 42]):
+    quality = [] if out.suffix.lower() == ".png" else [cv2.IMWRITE_JPEG_QUALITY, 42]
+    if not cv2.imwrite(str(out), np.vstack(rows), quality):
         raise CaseError(f"{out} cannot be written; check that its folder exists.")
 
 
