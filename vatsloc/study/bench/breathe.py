@@ -35,10 +35,12 @@ def bench_breathe(
     cases: list[dict[str, Any]] = []
     series: list[dict[str, Any]] = []
     for folder in folders:
-        if is_series(folder):
-            series += _series_rows(folder, drivers, say)
-        else:
-            cases += _rows(folder, drivers, say)
+        say(f"{folder.name} ...")
+        rows, kept = (_series_rows, series) if is_series(folder) else (_rows, cases)
+        for row in rows(folder, drivers):
+            kept.append(row)
+            left = f"{row['mean']:.2f} of {row['initial_mean']:.1f} mm left, " if "mean" in row else ""
+            say(f"{row['name']}: {row['driver']} by {row['by']}: {left}{row['seconds']:.0f} s")
     return {"cases": cases, "series": series}
 
 
@@ -62,16 +64,13 @@ def table(result: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _rows(folder: Path, drivers: Sequence[str], say: Callable[[str], None]) -> Iterator[dict[str, Any]]:
+def _rows(folder: Path, drivers: Sequence[str]) -> Iterator[dict[str, Any]]:
+    first = read_breath(folder)
     for driver in drivers:
-        case = read_breath(folder)
-        shown = [MASKS]
-        if case.images is not None:
-            shown.append(IMAGES)
-        if driver == "regional-pressure" and case.landmarks is not None:
+        shown = [MASKS] if first.images is None else [MASKS, IMAGES]
+        if driver == "regional-pressure" and first.landmarks is not None:
             shown.append(LANDMARKS)
         for by in shown:
-            say(f"{folder.name}: {driver} by {by} ...")
             began, used = perf_counter(), process_time()
             case = replace(read_breath(folder), masks_alone=by == MASKS)
             motion = run_driver(case, driver, STATES, lambda _: None, see_landmarks=by == LANDMARKS)
@@ -84,11 +83,10 @@ def _rows(folder: Path, drivers: Sequence[str], say: Callable[[str], None]) -> I
             yield {**row, "registration": beside, "theirs": PAPERS[driver]}
 
 
-def _series_rows(folder: Path, drivers: Sequence[str], say: Callable[[str], None]) -> Iterator[dict[str, Any]]:
+def _series_rows(folder: Path, drivers: Sequence[str]) -> Iterator[dict[str, Any]]:
     series = read_series(folder)
     for driver in drivers:
         for by in (MASKS, IMAGES):
-            say(f"{folder.name}: {driver} by {by} ...")
             began, used = perf_counter(), process_time()
             motion, found = bench_series(series, driver, by == MASKS)
             times = {"seconds": perf_counter() - began, "processor_seconds": process_time() - used}
