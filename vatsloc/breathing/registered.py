@@ -13,6 +13,7 @@ from poro.breathing.elastic import acting_at, breathe_out
 from poro.breathing.equilibrium import ConstraintTerms
 from poro.breathing.guide import guide
 from poro.mesh import TetMesh
+from registration.ffd import FfdSettings, Weights
 from registration.images.resample import resample_mask
 from registration.maps.rigid import RigidTransform
 from registration.sliding import LungImage, register_sliding
@@ -21,9 +22,10 @@ from vatsloc.breathing.case import BreathCase
 from vatsloc.breathing.lungs import Pair
 from vatsloc.breathing.motion import OUT, LungMotion, Motion
 from vatsloc.maps import MeshMap
-from vatsloc.workflow.pose import continued, ffd_settings
-from vatsloc.workflow.settings import Settings
+from vatsloc.workflow.pose import continued
 
+FAST = FfdSettings(spacing_mm=8.0, levels=4, voxel_mm=2.0, window_mm=14.0, weights=Weights())
+"""Coarser than a run's own settings: a lung in seconds, not minutes."""
 FAR_MM = 12.0
 """Mean motion by the masks from which on the registration starts there, and not from no motion."""
 
@@ -81,7 +83,7 @@ def by_registration(inspired: Volume, expired: Volume, pair: Pair, guess: Array)
     fit = register_sliding(
         LungImage(inspired, resample_mask(pair.inspired, inspired.grid)),
         LungImage(expired, resample_mask(pair.expired, expired.grid)),
-        ffd_settings(Settings().registration),
+        FAST,
         MeshMap(mesh, guess, RigidTransform.identity()) if far else None,
     )
     points = fit.moving_from_fixed(mesh.points)
