@@ -173,12 +173,15 @@ def breathe(
     fit_landmarks: Annotated[
         bool, typer.Option("--fit-landmarks", help="Experiment: regional-pressure is fitted to the landmarks as well.")
     ] = False,
+    masks_alone: Annotated[
+        bool, typer.Option("--masks-alone", help="Leave the registration of two images out of the motion.")
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Make the lungs of CASE breathe: meshes, fields, images and a film of every state."""
     from vatsloc.breathing.run import breathe_case
 
-    result = breathe_case(case, out, driver, states, say, fit_landmarks)
+    result = breathe_case(case, out, driver, states, say, fit_landmarks, masks_alone)
     if as_json:
         show(result)
     else:

@@ -6,7 +6,7 @@ bronchi hold it lengthwise and the front rises with the ribs.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.sparse import csr_matrix, diags
@@ -22,6 +22,11 @@ from poro.mesh.tetmesh import TetMesh
 
 STEP_MM, SMOOTH_MM = 5.0, 2.5
 """Of the samples of the cavity's distance."""
+TISSUE = Tissue(poisson=0.42)
+"""Of air-filled lung that keeps its gas: bulk modulus 4 P, shear modulus 0.7 P. Ref: Lai-Fook 1979. Over a deep breath
+the volume of every part then changes more evenly than with the 0.35 of a lung that is emptied."""
+PULL = 1.0
+"""Fluid keeps the pleurae together as firmly as they push: no gas lets the lung leave its wall."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +34,7 @@ class Inflating:
     """Everything about one lung's inspiration that no phase changes.
 
     guess: (n, 3) mm, the lung laid out by its spread; load: (n, 3) kPa mm2 at the end of the way; full_mm3: volume of
-    the inspired lung. The cavity's offsets say how far border nodes lie behind the wall at the start.
+    the inspired lung. The cavity's offsets say how far border nodes lie from the wall at the start.
     """
 
     mesh: TetMesh
@@ -47,26 +52,30 @@ class Inflating:
         return rest + share * (self.full_mm3 - rest)
 
     def at(self, share: float) -> Scene:
-        """What acts at a share of the way; nodes that start behind the wall are let back in little by little."""
-        wall = self.cavity
-        cavity = Cavity(wall.level, wall.nodes, wall.stiffness, (1 - share) * wall.offset)
+        """What acts at a share of the way: the wall is that far from its expired to its inspired shape."""
+        (_, expired), (_, inspired) = self.cavity.level
+        level = ((1 - share, expired), (share, inspired))
+        cavity = replace(self.cavity, level=level, offset=(1 - share) * self.cavity.offset)
         return Scene(
             self.mesh, self.material, ConstraintTerms(self.matrix, share * self.load), cavity=cavity, tree=self.tree
         )
 
 
-def inflating(lung: Lung, acting: Breathing) -> Inflating:
-    """The scene of a lung's inspiration; tissue is neo-Hookean with the moduli of `Tissue` where none is given."""
-    tissue, mesh, border = Tissue(), lung.expired, lung.expired.boundary
-    level = level_set(lung.inspired.boundary, STEP_MM, SMOOTH_MM)
-    behind = np.minimum(level.evaluate(border.points)[0], 0)
-    constraints, load = rising(lung, acting, tissue)
+def inflating(lung: Lung, acting: Breathing, known: ConstraintTerms | None = None) -> Inflating:
+    """The scene of a lung's inspiration, of neo-Hookean tissue; known: constraints at the end of the way that guide it
+    besides.
+    """
+    mesh, border = lung.expired, lung.expired.boundary
+    expired, inspired = (level_set(mesh.boundary, STEP_MM, SMOOTH_MM) for mesh in (lung.expired, lung.inspired))
+    start = expired.evaluate(border.points)[0]
+    matrix, load = rising(lung, acting, TISSUE)
+    acts = ConstraintTerms(matrix, load) if known is None else ConstraintTerms(matrix, load) + known
     return Inflating(
         mesh,
-        neo_hookean(tissue),
-        Cavity(level, border.nodes, WALL_KPA_PER_MM * border.node_areas, behind),
-        constraints,
-        load,
+        neo_hookean(TISSUE),
+        Cavity(((1.0, expired), (0.0, inspired)), border.nodes, WALL_KPA_PER_MM * border.node_areas, start, PULL),
+        acts.matrix,
+        acts.force,
         spread_map(mesh, lung.inspired)(mesh.points) - mesh.points,
         float(lung.inspired.volumes.sum()),
         tree_of(mesh),

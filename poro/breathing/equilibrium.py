@@ -52,22 +52,36 @@ class ConstraintTerms:
 
 @dataclass(frozen=True)
 class Cavity:
-    """Wall that pushes nodes back as k gap^2 / 2 once they are behind it, and never pulls. stiffness: (k,) kPa mm."""
+    """Wall that pushes nodes back as k gap^2 / 2 once they are behind it, and draws those that leave it. level: the
+    wall's distances (mm, positive within) and their shares of it, two while it moves from one shape to the other;
+    stiffness: (k,) kPa mm of nodes (k,); offset: (k,) mm, distance at which nodes touch; pull: stiffness of what draws
+    over that of what pushes, 0 for contact alone.
+    """
 
-    level: LevelSet
+    level: tuple[tuple[float, LevelSet], ...]
     nodes: Array
     stiffness: Array
     offset: Array
+    pull: float = 0.0
+
+    def distance(self, points: Array) -> tuple[Array, Array]:
+        """Distance (q,) mm within the wall and its slope (q, 3) at points (q, 3)."""
+        value, slope = np.zeros(len(points)), np.zeros_like(points)
+        for share, level in self.level:
+            if share > 0:
+                v, g, _ = level.evaluate(points)
+                value, slope = value + share * v, slope + share * g
+        return value, slope
 
     def respond(self, points: Array) -> tuple[float, Array, Array]:
         """Energy, nodal forces (n, 3) and their stiffness (n, 3, 3) at points (n, 3) mm."""
-        value, slope, _ = self.level.evaluate(points[self.nodes])
-        behind = np.minimum(value - self.offset, 0)
+        value, slope = self.distance(points[self.nodes])
+        gap = value - self.offset
+        stiffness = self.stiffness * np.where(gap < 0, 1.0, self.pull)
         force, block = np.zeros_like(points), np.zeros((len(points), 3, 3))
-        force[self.nodes] = -(self.stiffness * behind)[:, None] * slope
-        touching = self.stiffness * (behind < 0)
-        block[self.nodes] = touching[:, None, None] * slope[:, :, None] * slope[:, None, :]
-        return float((self.stiffness * behind**2).sum() / 2), force, block
+        force[self.nodes] = -(stiffness * gap)[:, None] * slope
+        block[self.nodes] = stiffness[:, None, None] * slope[:, :, None] * slope[:, None, :]
+        return float((stiffness * gap**2).sum() / 2), force, block
 
 
 @dataclass(frozen=True)

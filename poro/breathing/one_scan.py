@@ -7,7 +7,7 @@ diaphragm is pulled towards the feet by a traction, and the whole surface outwar
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.sparse import bsr_matrix, coo_matrix, diags
@@ -101,6 +101,13 @@ class OneScan:
             found.append(filled)
             u, before = filled.u, share
         return found
+
+    def guided(self, known: ConstraintTerms, breath_mm3: float) -> OneScan:
+        """The scene of a lung whose motion is known over a breath of `breath_mm3`: constraints that ask for it replace
+        all that is supposed of border, traction and weight."""
+        none = np.zeros_like(self.mesh.points)
+        constraints = ConstraintTerms(known.matrix, none)
+        return replace(self, constraints=constraints, pull=none, wanted=known.force / breath_mm3, weight=none)
 
 
 def one_scan(mesh: TetMesh, side: Side) -> OneScan:

@@ -1,4 +1,4 @@
-"""Pressure-volume curve of the lung, parameterised by an exponential.
+"""Pressure-volume curve of the lung, parameterised by an exponential, and the recoil of a deformed one.
 
 Ref: Salazar & Knowles 1964; Eom 2010, fig. 5 (pressure read off a curve at each phase's volume).
 """
@@ -8,6 +8,10 @@ from __future__ import annotations
 import numpy as np
 
 from poro.arrays import Array
+from poro.fem.constitutive import neo_hookean
+from poro.fem.forms import deformation_gradient
+from poro.fem.tissue import Tissue
+from poro.mesh.tetmesh import TetMesh
 
 PER_PA = 0.147 / 98.07
 """Exponent of normal lungs, 0.147 per cmH2O."""
@@ -30,3 +34,15 @@ def pressure_volume(inspired_ml: Array, rest_ml: float) -> Array:
 def inspired_volume(pressure_pa: Array, compliance_ml_per_pa: float) -> Array:
     """The curve the other way: volume (k,) ml above rest at a rise of the recoil pressure (k,) Pa."""
     return np.asarray(compliance_ml_per_pa / PER_PA * (1 - np.exp(-PER_PA * np.asarray(pressure_pa, float))))
+
+
+def recoil_pa(mesh: TetMesh, nodes: Array, tissue: Tissue) -> float:
+    """By what the recoil of neo-Hookean tissue rises (less than 0: falls) as a mesh's nodes move to (n, 3) mm: the mean
+    of its hydrostatic stress, in Pa. Inverted elements are left out.
+    """
+    f = deformation_gradient(mesh, nodes - mesh.points)
+    det = np.linalg.det(f)
+    whole = det > 0
+    _, stress, _ = neo_hookean(tissue).respond(f[whole])
+    pressure = np.einsum("mij,mij->m", stress, f[whole]) / det[whole] / 3
+    return 1000 * float(np.average(pressure, weights=(det * mesh.volumes)[whole]))

@@ -11,18 +11,18 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy import ndimage
-from scipy.sparse import coo_matrix, csr_matrix, diags
+from scipy.sparse import coo_matrix, csr_matrix, diags, hstack
 
 from poro.arrays import Array
 from poro.breathing.cavity import rising
 from poro.breathing.elastic import Breathing, Lung, Side, caudal, hilum
 from poro.breathing.equilibrium import ConstraintTerms
-from poro.fem.constraints import point_constraints
-from poro.fem.forms import tangent_stiffness
+from poro.fem.constraints import interpolation_matrix, point_constraints
+from poro.fem.forms import deformation_gradient, eigenstress_load, tangent_stiffness
 from poro.fem.tissue import Tissue
 from poro.linalg.solver import linear_solver
 from poro.mesh import TetMesh, TriSurface, closest_points, stuff
-from poro.mesh.locate import Location, interpolate
+from poro.mesh.locate import Location, interpolate, locate
 
 LUNG, BODY = Tissue(young_kpa=0.9, poisson=0.4), Tissue(young_kpa=7.8, poisson=0.43)
 """Ref: Fuerst, section 2.2."""
@@ -32,11 +32,9 @@ SECTORS, STOREYS, DIAPHRAGM = 4, 3, 2
 """Patches about the lung and along it, and on the diaphragm: 14 pressures."""
 STICK_KPA_PER_MM = 0.5
 """Sliding contact that neither lets bodies part nor enter each other: it gives way by 1 mm at 0.5 kPa."""
-TOUCH_MM = 10.0
-"""Farther from a wall at rest the lung does not touch it."""
-ANCHOR = 0.2
-"""Stiffness, over the tissue's own, by which the chest is held everywhere; back and mediastinum are held 30 times as
-firmly. The shell is no closed ring, and a round lung would turn in it."""
+ANCHOR, FIRM = 0.2, 30.0
+"""Stiffness, over the tissue's own, by which chest and body below are held everywhere; back and mediastinum are held
+`FIRM` times as firmly, and so is the body below, sideways."""
 SURFACE_ROUNDS, INNER = 12, 3
 PRIOR_MM_PER_KPA = 0.5
 """Root mean square distance that a pressure of 1 kPa is held to be worth."""
@@ -50,18 +48,19 @@ STILL_MM = 0.3
 
 @dataclass(frozen=True)
 class Thorax:
-    """Three bodies in one mesh that share no node. lung: (nl,) nodes that belong to the lung, first in the mesh;
-    walls: inner surface of chest and of what is below, in nodes of the mesh; patch: (t,) of every triangle of `walls`,
-    -1 for none; gap: (k,) mm between the lung's border and the walls at rest; anchors: constraints that hold
-    the chest and the lung's bronchi; load: (n, 3) kPa mm2 on the lung at the end of an inspiration.
+    """Three bodies in one mesh that share no node. moduli: (m, 2) kPa, Lame's of every tetrahedron; lung: its nodes
+    come first in the mesh; walls: what the lung slides on, its own border at rest, as chest and the body below carry
+    it; carried: (w, n) weights of the mesh's nodes in the walls'; patch: (t,) of every triangle of `walls`; anchors:
+    constraints that hold chest, body below and the lung's bronchi; load: (n, 3) kPa mm2 on the lung at the end of an
+    inspiration.
     """
 
     mesh: TetMesh
-    elastic: csr_matrix
+    moduli: Array
     lung: TetMesh
     walls: TriSurface
+    carried: csr_matrix
     patch: Array
-    gap: Array
     anchors: csr_matrix
     load: Array
 
@@ -69,6 +68,10 @@ class Thorax:
     def patches(self) -> int:
         """Number of pressures."""
         return int(self.patch.max()) + 1
+
+    def moved_walls(self, u: Array) -> TriSurface:
+        """The walls where displacements u (n, 3) mm of the mesh carry them."""
+        return self.walls.moved(self.walls.points + self.carried @ u)
 
 
 @dataclass(frozen=True)
@@ -123,33 +126,54 @@ def thorax(inside: Array, ras_from_ijk: Array, pair: Lung, acting: Breathing) ->
     tets = np.concatenate([mesh.tets + start for mesh, start in zip((lung, *bodies), starts[:-1], strict=True)])
     kinds = np.repeat([0, 1, 1], [len(lung.tets), *(len(body.tets) for body in bodies)])
     mesh = TetMesh(points, tets)
-    walls, patch = _walls(bodies, starts, lung, points)
-    gap = closest_points(walls, lung.boundary.points)
-    rest = np.einsum("qd,qd->q", lung.boundary.points - gap.points, walls.normals[gap.triangle])
+    walls = lung.boundary
+    carried, is_below = _carried(walls, bodies, len(lung.points))
     constraints, load = np.zeros(3 * len(points)), np.zeros_like(points)
     bronchi, load[: len(lung.points)] = rising(pair, acting, LUNG)
     constraints[: 3 * len(lung.points)] = bronchi.diagonal()
     anchors = (_anchors(bodies, starts, points, pair, towards) + diags(constraints)).tocsr()
-    return Thorax(mesh, _elastic(mesh, kinds), lung, walls, patch, rest, anchors, load)
+    moduli = np.array([[tissue.lame_kpa, tissue.shear_kpa] for tissue in (LUNG, BODY)])[kinds]
+    return Thorax(mesh, moduli, lung, walls, carried, _patches(walls, is_below, lung), anchors, load)
 
 
 def press(scene: Thorax, p: Array, start: Array, share: float = 1.0, rounds: int = INNER) -> Pressed:
     """Balance of the bodies under pressures p (k,) kPa from displacements (n, 3) mm, and its derivative by them.
 
-    Tissue is linear about its rest; contact and the pressures' direction follow the moving walls, round by round.
+    Tissue is linear in a frame that turns with every element; that frame, contact and the pressures' direction follow
+    the bodies, round by round. Ref: Mueller & Gross 2004 (corotational elasticity).
     """
     u, k = start, len(p)
     answers = np.zeros((*start.shape, k + 1))
     for _ in range(rounds):
         forces = _patch_forces(scene, u)
         contact = _contact(scene, u)
-        matrix = (scene.elastic + contact.matrix + scene.anchors).tocsr()
-        right = np.concatenate([(contact.force + share * scene.load)[:, :, None], forces], axis=2)
+        moduli, stress = _turned(scene, u)
+        tangent = tangent_stiffness(scene.mesh, moduli)
+        matrix = (tangent + contact.matrix + scene.anchors).tocsr()
+        known = (tangent @ u.ravel()).reshape(-1, 3) - eigenstress_load(scene.mesh, stress)
+        right = np.concatenate([(known + contact.force + share * scene.load)[:, :, None], forces], axis=2)
         answers = linear_solver(matrix, scene.mesh.points).solve(right.reshape(-1, k + 1)).reshape(answers.shape)
         last, u = u, answers[:, :, 0] + answers[:, :, 1:] @ p
         if np.abs(u - last).max() < STILL_MM:
             break
     return Pressed(p, u, answers[:, :, 1:])
+
+
+def _turned(scene: Thorax, u: Array) -> tuple[Array, Array]:
+    """Moduli (m, 3, 3, 3, 3) and first Piola-Kirchhoff stress (m, 3, 3), kPa, of elements that turn as they are."""
+    f = deformation_gradient(scene.mesh, u)
+    left, _, right = np.linalg.svd(f)
+    left[:, :, 2] *= np.sign(np.linalg.det(left @ right))[:, None]
+    turn = left @ right
+    strain = np.einsum("mai,maj->mij", turn, f) - np.eye(3)
+    strain = (strain + strain.transpose(0, 2, 1)) / 2
+    lame, shear = scene.moduli.T
+    stress = 2 * shear[:, None, None] * strain + (lame * np.trace(strain, axis1=1, axis2=2))[:, None, None] * np.eye(3)
+    pairs = np.einsum("mij,mkl->mijkl", turn, turn)
+    along = shear[:, None, None, None, None] * (
+        np.einsum("ik,jl->ijkl", np.eye(3), np.eye(3)) + pairs.transpose(0, 1, 4, 3, 2)
+    )
+    return lame[:, None, None, None, None] * pairs + along, turn @ stress
 
 
 def fit_pressures(
@@ -227,94 +251,83 @@ def _distances(
 
 
 def _contact(scene: Thorax, u: Array) -> ConstraintTerms:
-    """Contact along the walls' normals that keeps the gap at rest between lung and walls, wherever the lung slid to."""
-    border = scene.lung.boundary
-    walls = scene.walls.moved(scene.walls.points + u[scene.walls.nodes])
+    """Contact along the walls' normals that keeps the lung's border on the walls, wherever it slid to."""
+    border, walls = scene.lung.boundary, scene.moved_walls(u)
     here = border.points + u[border.nodes]
     near = closest_points(walls, here)
     normal = walls.normals[near.triangle]
-    corners = walls.nodes[walls.triangles[near.triangle]]
-    rows = np.arange(len(here))
-    n = len(u)
-    operator = coo_matrix((np.ones(len(here)), (rows, border.nodes)), shape=(len(here), n)) - coo_matrix(
-        (near.barycentric.ravel(), (np.repeat(rows, 3), corners.ravel())), shape=(len(here), n)
+    rows, n = np.arange(len(here)), len(u)
+    at_wall = coo_matrix(
+        (near.barycentric.ravel(), (np.repeat(rows, 3), walls.triangles[near.triangle].ravel())),
+        shape=(len(here), len(walls.points)),
     )
-    operator = operator.tocsr()
+    operator = (
+        coo_matrix((np.ones(len(here)), (rows, border.nodes)), (len(here), n)) - at_wall @ scene.carried
+    ).tocsr()
     apart = np.einsum("qd,qd->q", here - near.points, normal)
-    wanted = np.einsum("qd,qd->q", operator @ u, normal) + scene.gap - apart
-    # Where a wall is missing, between chest and diaphragm, the nearest one is none of the lung's.
-    area = border.moved(here).node_areas * (np.abs(scene.gap) < TOUCH_MM) * (np.abs(apart - scene.gap) < 2 * TOUCH_MM)
+    wanted = np.einsum("qd,qd->q", operator @ u, normal) - apart
+    area = border.moved(here).node_areas
     stiffness = STICK_KPA_PER_MM * area[:, None, None] * normal[:, :, None] * normal[:, None, :]
     return ConstraintTerms(*point_constraints(operator, stiffness, wanted[:, None] * normal))
 
 
 def _patch_forces(scene: Thorax, u: Array) -> Array:
     """Nodal forces (n, 3, k) kPa mm2 per kPa of every patch, pulling the walls away from the lung."""
-    walls = scene.walls.moved(scene.walls.points + u[scene.walls.nodes])
-    forces = np.zeros((*u.shape, scene.patches))
-    for k in range(scene.patches):
-        chosen = scene.patch == k
-        # The walls' outward normal points into the lung.
-        pull = -walls.area_vectors[chosen] / 3
-        for corner in range(3):
-            np.add.at(forces[:, :, k], walls.nodes[walls.triangles[chosen, corner]], pull)
-    return forces
+    walls = scene.moved_walls(u)
+    forces = np.zeros((len(walls.points), 3, scene.patches))
+    for corner in range(3):
+        np.add.at(forces, (walls.triangles[:, corner], slice(None), scene.patch), walls.area_vectors / 3)
+    return np.asarray((scene.carried.T @ forces.reshape(len(walls.points), -1)).reshape(len(u), 3, -1))
 
 
-def _walls(bodies: Sequence[TetMesh], starts: Array, lung: TetMesh, points: Array) -> tuple[TriSurface, Array]:
-    """Faces of the bodies that look at the lung, and the patch of each."""
-    triangles, is_below = [], []
-    for number, body in enumerate(bodies):
-        surface = body.boundary
-        middle = surface.points[surface.triangles].mean(axis=1)
-        near = closest_points(lung.boundary, middle)
-        facing = np.einsum("td,td->t", surface.normals, near.points - middle) > 0
-        chosen = (np.abs(near.distance) < 12.0) & facing
-        triangles.append(surface.nodes[surface.triangles[chosen]] + starts[1 + number])
-        is_below.append(np.full(int(chosen.sum()), number == 1))
-    all_, below = np.concatenate(triangles), np.concatenate(is_below)
-    nodes, local = np.unique(all_, return_inverse=True)
-    walls = TriSurface(points[nodes], local.reshape(-1, 3), nodes)
+def _carried(walls: TriSurface, bodies: Sequence[TetMesh], lung_nodes: int) -> tuple[csr_matrix, Array]:
+    """Weights (w, n) by which the nearer body carries every point of the walls, and whether (w,) it is the one below.
+
+    Bodies are coarser than the lung: what it slides on is as smooth as itself.
+    """
+    held = [locate(body, walls.points) for body in bodies]
+    is_below = held[1].distance < held[0].distance
+    weights = [
+        diags((is_below == below).astype(float)) @ interpolation_matrix(where, len(body.points))
+        for where, body, below in zip(held, bodies, (False, True), strict=True)
+    ]
+    return hstack([csr_matrix((len(walls.points), lung_nodes)), *weights]).tocsr(), is_below
+
+
+def _patches(walls: TriSurface, is_below: Array, lung: TetMesh) -> Array:
+    """Patch (t,) of every triangle: sectors and storeys of the chest, front and back of the diaphragm."""
+    below = is_below[walls.triangles].sum(axis=1) >= 2
     middle = walls.points[walls.triangles].mean(axis=1)
     centre = np.average(lung.points, axis=0, weights=lung.node_volumes)
     angle = np.arctan2(middle[:, 1] - centre[1], middle[:, 0] - centre[0])
     sector = np.floor((angle + np.pi) / (2 * np.pi) * SECTORS).astype(int) % SECTORS
     height = np.argsort(np.argsort(middle[:, 2])) * STOREYS // len(middle)
-    patch = sector + SECTORS * height
-    patch = np.where(below, SECTORS * STOREYS + (middle[:, 1] > centre[1]), patch)
-    _, patch = np.unique(patch, return_inverse=True)
-    return walls, patch
+    patch = np.where(below, SECTORS * STOREYS + (middle[:, 1] > centre[1]), sector + SECTORS * height)
+    return np.asarray(np.unique(patch, return_inverse=True)[1])
 
 
 def _anchors(bodies: Sequence[TetMesh], starts: Array, points: Array, pair: Lung, towards: float) -> csr_matrix:
     """Constraints that hold the chest, firmly at its back, and the far side of what is below."""
-    held = np.zeros(len(points))
+    held = np.zeros((len(points), 3))
     chest, below = bodies
     lung, side = pair.expired, pair.side
     size = BODY.young_kpa * np.cbrt(chest.node_volumes)
     inward = chest.points[:, 0] * (1.0 if side == "left" else -1.0)
     firm = (chest.points[:, 1] < np.quantile(chest.points[:, 1], 0.12)) | (inward > np.quantile(inward, 0.85))
-    held[starts[1] : starts[2]] = ANCHOR * size * np.where(firm, 30.0, 1.0)
+    held[starts[1] : starts[2]] = (ANCHOR * size * np.where(firm, FIRM, 1.0))[:, None]
     size = BODY.young_kpa * np.cbrt(below.node_volumes)
     depth = towards * below.points[:, 2]
-    held[starts[2] : starts[3]] = ANCHOR * size * np.where(depth > np.quantile(depth, 0.7), 1.0, 0.1)
-    held[: starts[1]] = TETHER * LUNG.young_kpa * np.cbrt(lung.node_volumes) * _near_hilum(lung, side)
-    return diags(np.repeat(held, 3)).tocsr()
+    along = np.where(depth > np.quantile(depth, 0.7), 1.0, 0.1)
+    # Ribs and belly wall, which no body here stands for, keep it from moving sideways.
+    aside = np.full(len(along), FIRM)
+    held[starts[2] : starts[3]] = (ANCHOR * size)[:, None] * np.column_stack([aside, aside, along])
+    held[: starts[1]] = (TETHER * LUNG.young_kpa * np.cbrt(lung.node_volumes) * _near_hilum(lung, side))[:, None]
+    return diags(held.ravel()).tocsr()
 
 
 def _near_hilum(lung: TetMesh, side: Side) -> Array:
     """How near (n,) the lung's nodes lie to where bronchi and vessels tether it, 1 at the hilum."""
     return np.exp(-(((lung.points - hilum(lung, side)) / HILUM_MM) ** 2).sum(axis=1)) + 1e-6
-
-
-def _elastic(mesh: TetMesh, kinds: Array) -> csr_matrix:
-    """Linear stiffness (3n, 3n) with the lung's moduli where kinds (m,) is 0 and those of the bodies elsewhere."""
-    eye = np.eye(3)
-    moduli = np.empty((2, 3, 3, 3, 3))
-    for kind, tissue in enumerate((LUNG, BODY)):
-        twice = np.einsum("ik,jl->ijkl", eye, eye) + np.einsum("il,jk->ijkl", eye, eye)
-        moduli[kind] = tissue.lame_kpa * np.einsum("ij,kl->ijkl", eye, eye) + tissue.shear_kpa * twice
-    return tangent_stiffness(mesh, moduli[kinds])
 
 
 def _largest(inside: Array) -> Array:

@@ -7,12 +7,13 @@ import pytest
 from breathing_shapes import HALF, pear
 from numpy.testing import assert_allclose
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from poro.arrays import Array
 from poro.breathing.body import Body, body, border_motion, network, spring_stiffness
 from poro.breathing.elastic import WALL_ALONE, Lung
 from poro.breathing.mesh_quality import _slopes, quality, smooth, violations
-from poro.breathing.regional import Thorax, fit_pressures, press, thorax
+from poro.breathing.regional import Thorax, _turned, fit_pressures, press, thorax
 from poro.mesh import TetMesh, stuff
 
 REGULAR = np.array([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
@@ -94,6 +95,40 @@ def test_pressures_pull_lung_and_wall_outward_and_their_derivative_is_what_they_
     outward = np.einsum("nd,nd->n", found.u[border.nodes] - rest.u[border.nodes], border.node_normals)
     assert np.average(outward, weights=border.node_areas) > 0.05
     assert scene.patches >= 12
+
+
+def test_bodies_that_turn_as_one_are_free_of_stress(chest: tuple[Thorax, Lung]) -> None:
+    scene, _ = chest
+    turn = Rotation.from_rotvec([0.3, -0.5, 0.9]).as_matrix()
+    _, stress = _turned(scene, scene.mesh.points @ turn.T - scene.mesh.points)
+    assert_allclose(stress, 0, atol=1e-12)
+
+
+def test_stress_in_a_turned_frame_is_linear_in_the_stretch_and_the_moduli_are_its_derivative(
+    chest: tuple[Thorax, Lung],
+) -> None:
+    scene, _ = chest
+    x = scene.mesh.points
+    turn = Rotation.from_rotvec([0.3, -0.5, 0.9]).as_matrix()
+    strain = np.array([[0.1, 0.02, 0.0], [0.02, -0.05, 0.01], [0.0, 0.01, 0.03]])
+    way = np.array([[0.3, -0.2, 0.5], [-0.2, 0.1, 0.4], [0.5, 0.4, -0.6]])
+    moduli, stress = _turned(scene, x @ (turn @ (np.eye(3) + strain)).T - x)
+    lame, shear = scene.moduli[0]
+    assert_allclose(stress[0], turn @ (2 * shear * strain + lame * np.trace(strain) * np.eye(3)), atol=1e-12)
+    step = 1e-6
+    ahead = _turned(scene, x @ (turn @ (np.eye(3) + strain + step * way)).T - x)[1]
+    assert_allclose((ahead - stress) / step, np.einsum("mijkl,kl->mij", moduli, turn @ way), atol=1e-6)
+
+
+def test_walls_lie_on_the_lung_and_move_as_the_bodies_about_it(chest: tuple[Thorax, Lung]) -> None:
+    scene, lung = chest
+    assert_allclose(scene.walls.points, lung.expired.boundary.points)
+    assert_allclose(scene.carried.sum(axis=1), 1.0)
+    u = np.zeros_like(scene.mesh.points)
+    u[len(lung.expired.points) :] = [1.0, -2.0, 3.0]
+    assert_allclose(
+        scene.moved_walls(u).points - scene.walls.points, np.tile([1.0, -2.0, 3.0], (len(u[scene.walls.nodes]), 1))
+    )
 
 
 def test_the_fit_brings_the_border_nearer_to_the_inspired_one(chest: tuple[Thorax, Lung]) -> None:

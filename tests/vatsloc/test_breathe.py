@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import nibabel as nib
@@ -15,10 +16,10 @@ from poro.arrays import Array
 from registration.volume import Mask, Volume
 from vatsloc.breathing.case import read_breath
 from vatsloc.breathing.drr import WATER_PER_MM, radiograph
-from vatsloc.breathing.lungs import both_scans
+from vatsloc.breathing.lungs import Pair, both_scans
 from vatsloc.breathing.masks import lungs_of
-from vatsloc.breathing.motion import IN, OUT, LungMotion, Motion
-from vatsloc.breathing.run import breathe_case
+from vatsloc.breathing.motion import IN, OUT, LungMotion, Motion, along
+from vatsloc.breathing.run import DRIVERS, breathe_case, run_driver
 from vatsloc.breathing.score import score
 from vatsloc.breathing.signal import quiet_breath, sampled
 from vatsloc.cli import app
@@ -219,6 +220,73 @@ def test_points_move_with_the_lung_they_lie_in_and_are_scored_the_way_it_goes(pe
     assert scores is not None
     assert scores["mean"] == pytest.approx(3.0, abs=1e-6)
     assert scores["initial_mean"] == pytest.approx(np.hypot(7.0, 3.0))
+
+
+@pytest.mark.parametrize("direction", [OUT, IN])
+def test_a_signal_leads_there_and_back_by_volume(direction: str) -> None:
+    from tests.poro.breathing_shapes import pear
+
+    mesh = pear()
+    end = mesh.points * (0.9 if direction == OUT else 1.1)
+    states = tuple(mesh.points + s * (end - mesh.points) for s in np.linspace(0, 1, 11))
+    way = Motion("surface", direction, (LungMotion("right", mesh, states),), tuple(np.linspace(0, 50, 11)), 10)
+    volume = np.array([1.0, 0.4, 0.0, 0.4, 1.0]) if direction == OUT else np.array([0.0, 0.6, 1.0, 0.6, 0.0])
+    breath = along(way, volume)
+    assert breath.end == 2
+    lung = breath.lungs[0]
+    assert_allclose(lung.states[0], mesh.points, atol=1e-9)
+    assert_allclose(lung.states[2], end, atol=1e-9)
+    assert_allclose(lung.states[4], lung.states[0], atol=1e-9)
+    assert_allclose(lung.states[3], lung.states[1], atol=1e-9)
+    held = np.array([breath.volume_ml(n) for n in range(5)])
+    assert_allclose((held - held.min()) / np.ptp(held), volume, atol=0.01)
+    assert along(way, np.full(3, 0.5)).end is None
+
+
+@pytest.mark.parametrize("driver", list(DRIVERS))
+def test_registration_of_two_images_drives_every_driver(
+    person: Path, driver: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def known(inspired: Volume, expired: Volume, pair: Pair, guess: Array) -> Array:
+        centre = CENTRES[pair.side]
+        return (pair.lung.inspired.points - centre) @ SQUEEZE + centre + BACK
+
+    monkeypatch.setattr("vatsloc.breathing.registered.by_registration", known)
+    case = read_breath(person)
+    blank = Volume(np.zeros((4, 4, 4), np.float32), np.eye(4))
+    scans = [replace(scan, image=blank) for scan in (case.inspiration, case.expiration) if scan is not None]
+    case = replace(case, inspiration=scans[0], expiration=scans[1])
+    motion = run_driver(case, driver, 3, lambda _: None)
+    assert motion.registered is not None
+    beside, ours = score(motion.registered, case.landmarks), score(motion, case.landmarks)
+    assert beside is not None
+    assert beside["mean"] < 0.2
+    alone = run_driver(replace(case, masks_alone=True), driver, 3, lambda _: None)
+    assert alone.registered is None
+    by_masks = score(alone, case.landmarks)
+    if driver != "regional-pressure":  # whose pressures may not do what is known
+        assert ours is not None
+        assert ours["mean"] < 0.25 * ours["initial_mean"]
+        assert by_masks is not None
+        assert ours["mean"] < by_masks["mean"]
+
+
+@pytest.mark.parametrize("kind", ["joined", "pieces", "strays", "slices", "torn", "no back"])
+def test_a_driver_answers_whatever_dirt_the_masks_have(person: Path, kind: str) -> None:
+    clean = run_driver(read_breath(person), "surface", 2, lambda _: None)
+    if kind == "no back":
+        lost = lungs(SQUEEZE)
+        y = np.arange(SHAPE[1]) * SPACING + ORIGIN[1]
+        lost[np.ix_(np.arange(SHAPE[0]), y < -15, np.arange(35, 60))] = False
+        save(person / "lungs_expiration.nii.gz", lost)
+    else:
+        save(person / "lungs_inspiration.nii.gz", dirty(kind))
+    motion = run_driver(read_breath(person), "surface", 2, lambda _: None)
+    found, wanted = (score(m, person / "landmarks_ras_mm.csv") for m in (motion, clean))
+    assert found is not None
+    assert wanted is not None
+    assert found["n"] == wanted["n"]
+    assert found["mean"] < wanted["mean"] + 1.0
 
 
 def test_a_quiet_breath_and_a_sampled_signal() -> None:

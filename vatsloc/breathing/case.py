@@ -76,7 +76,9 @@ class Scan:
 
 @dataclass(frozen=True)
 class BreathCase:
-    """Scans of a folder; expiration None where there is but one; signal (k, 2): seconds and volume 0..1, or None."""
+    """Scans of a folder; expiration None where there is but one; signal (k, 2): seconds and volume 0..1, or None;
+    masks_alone: two images, where there are, are not registered.
+    """
 
     name: str
     folder: Path
@@ -86,6 +88,15 @@ class BreathCase:
     landmarks: Path | None
     hysteresis: float = 0.0
     tumour: Tumour | None = None
+    masks_alone: bool = False
+
+    @property
+    def images(self) -> tuple[Volume, Volume] | None:
+        """Inspired and expired image to be registered; None where there are not both, or masks alone are asked for."""
+        if self.masks_alone or self.inspiration is None or self.expiration is None:
+            return None
+        full, rest = self.inspiration.image, self.expiration.image
+        return None if full is None or rest is None else (full, rest)
 
 
 def read_breath(folder: Path) -> BreathCase:

@@ -23,7 +23,7 @@ MUCH = 2.5
 
 @dataclass(frozen=True)
 class Pair:
-    """One lung in both scans: masks, and meshes made of them. depth: of the breath (`depth_of`)."""
+    """One lung in both scans: masks, and meshes made of them. depth: of the breath (`depth_of`), one for both lungs."""
 
     side: Side
     inspired: Mask
@@ -50,10 +50,11 @@ def both_scans(case: BreathCase, edge_mm: float = EDGE_MM) -> tuple[list[Pair], 
     for side in set(inspired.lungs) ^ set(expired.lungs):
         notes.append(f"The {side} lung is shown by one of the scans only and was left out.")
     pairs = []
+    # A person breathes with both lungs at once, whatever either mask has lost.
+    depth = depth_of(sum(_mm3(inspired.lungs[s]) for s in sides) / sum(_mm3(expired.lungs[s]) for s in sides))
     for side in sides:
         full, rest = inspired.lungs[side], expired.lungs[side]
-        ratio = float(full.inside.sum() * full.grid.spacing.prod() / (rest.inside.sum() * rest.grid.spacing.prod()))
-        depth = depth_of(ratio)
+        ratio = _mm3(full) / _mm3(rest)
         if case.expiration.image is None:
             rest = to_the_back(rest, full)
         if not 1 / MUCH < ratio < MUCH * 1.5:
@@ -75,6 +76,10 @@ def masks_of(scan: Scan) -> CleanLungs:
     work, _, halves, _ = lung_halves(scan.image)
     both = np.logical_or.reduce(list(halves.values()))
     return lungs_of(on_grid(both, work.grid, work.grid), scan.name)
+
+
+def _mm3(lung: Mask) -> float:
+    return float(lung.inside.sum() * lung.grid.spacing.prod())
 
 
 def meshed(lung: Mask, edge_mm: float) -> TetMesh:

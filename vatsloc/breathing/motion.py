@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,8 @@ from poro.mesh.tetmesh import signed_volumes
 from vatsloc.frames import Side
 
 OUT, IN = "inspiration to expiration", "expiration to inspiration"
+FULL_DEPTH = 0.98
+"""Share of the breath from which on a state stands for the other scan."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +33,8 @@ class LungMotion:
 @dataclass(frozen=True)
 class Motion:
     """States of a breath. direction: from which scan to which; end: state that stands for the other scan, None where
-    there is none; pressure_pa: of the lung's recoil, one per state; details: of the driver, for the page and the JSON.
+    there is none; pressure_pa: of the lung's recoil, one per state; details: of the driver, for the page and the JSON;
+    registered: what two images told, as a motion of its own that drove this one.
     """
 
     driver: str
@@ -41,6 +44,7 @@ class Motion:
     end: int | None
     warnings: tuple[str, ...] = ()
     details: dict[str, Any] = field(default_factory=dict)
+    registered: Motion | None = None
 
     @property
     def count(self) -> int:
@@ -74,6 +78,25 @@ def between(u: Array, knots: Array, share: float) -> Array:
     k = min(int(np.searchsorted(knots, share, "right")) - 1, len(knots) - 2)
     part = (share - knots[k]) / (knots[k + 1] - knots[k])
     return np.asarray((1 - part) * u[k] + part * u[k + 1])
+
+
+def along(motion: Motion, volume: Array) -> Motion:
+    """The same way, from the first scan to the other, in states at volumes (k,), 0 expiration to 1 inspiration, of a
+    breath: what the lungs hold together tells how far they are on it.
+    """
+    held = np.array([motion.volume_ml(n) for n in range(motion.count)])
+    done = np.maximum.accumulate((held - held[0]) / (held[-1] - held[0]))
+    knots = shares(motion.count)
+    progress = volume if motion.direction == IN else 1 - volume
+    at = np.interp(progress, done, knots)
+    lungs = tuple(
+        LungMotion(lung.side, lung.mesh, tuple(between(np.stack(lung.states), knots, s) for s in at))
+        for lung in motion.lungs
+    )
+    pressure = tuple(float(p) for p in np.interp(at, knots, motion.pressure_pa))
+    deepest = int(np.argmax(progress))
+    end = deepest if motion.end is not None and progress[deepest] > FULL_DEPTH else None
+    return replace(motion, lungs=lungs, pressure_pa=pressure, end=end)
 
 
 def shares(count: int) -> Array:

@@ -15,8 +15,9 @@ from poro.arrays import Array
 from poro.breathing.one_scan import TRACTION, OneScan, one_scan
 from registration.volume import Mask
 from vatsloc.breathing.case import BreathCase, Scan
-from vatsloc.breathing.lungs import masks_of, meshed
-from vatsloc.breathing.motion import IN, OUT, LungMotion, Motion, between
+from vatsloc.breathing.lungs import both_scans, masks_of, meshed
+from vatsloc.breathing.motion import FULL_DEPTH, IN, OUT, LungMotion, Motion, between
+from vatsloc.breathing.registered import as_motion, register
 from vatsloc.breathing.signal import PERIOD_S, quiet_breath, sampled
 from vatsloc.errors import InputRefused
 
@@ -30,7 +31,8 @@ KNOTS = 5
 def drive(case: BreathCase, count: int, say: Callable[[str], None]) -> Motion:
     """States along the signal from the scan and back to it; the scan is that of the inspiration where there are both.
 
-    Of a second scan the volume alone is taken, as the depth of the breath; and its landmarks score the deepest state.
+    Of a second scan the volume alone is taken, as the depth of the breath, unless two images are registered; and its
+    landmarks score the deepest state.
     """
     scan = case.inspiration or case.expiration
     assert scan is not None
@@ -44,15 +46,19 @@ def drive(case: BreathCase, count: int, say: Callable[[str], None]) -> Motion:
     else:
         t, volume = sampled(case.signal, count)
     share = volume if direction == IN else 1 - volume
+    found = None if case.images is None else register(case, both_scans(case, EDGE_MM)[0], say)
+    known = {} if found is None else {r.pair.side: r for r in found}
     lungs, pressures = [], []
     for side, mask in clean.lungs.items():
-        mesh = meshed(mask, EDGE_MM)
+        mesh = known[side].inspired if side in known else meshed(mask, EDGE_MM)
         say(f"{side} lung: {KNOTS - 1} equilibria ...")
         try:
             scene = one_scan(mesh, side)
         except ValueError as refusal:
             raise InputRefused(f"The {side} lung of {case.folder}: {refusal}.") from refusal
         rest = float(mesh.volumes.sum())
+        if side in known:
+            scene = scene.guided(known[side].outward(), rest * (full / start - 1))
         knots = np.linspace(0, 1, KNOTS)
         settled = scene.states([rest * (1 + k * (full / start - 1)) for k in knots[1:]])
         u = np.stack([np.zeros_like(mesh.points), *(s.u for s in settled)])
@@ -66,12 +72,12 @@ def drive(case: BreathCase, count: int, say: Callable[[str], None]) -> Motion:
         pressures.append(np.interp(share, knots, p))
     pressure = tuple(float(v) for v in np.mean(pressures, axis=0))
     deepest = int(np.argmax(share))
-    # Only the state at full depth stands for the other scan.
-    end = deepest if case.inspiration is not None and case.expiration is not None and share[deepest] > 0.98 else None
+    two = case.inspiration is not None and case.expiration is not None
+    end = deepest if two and share[deepest] > FULL_DEPTH else None
     if end is None and case.landmarks is not None:
         notes.append("No state reaches the other scan's depth, so landmarks are not scored; take an odd --states.")
     details: dict[str, Any] = {"time_s": t.tolist(), "signal": volume.tolist(), "hysteresis": case.hysteresis}
-    return Motion("one-scan", direction, tuple(lungs), pressure, end, tuple(notes), details)
+    return Motion("one-scan", direction, tuple(lungs), pressure, end, tuple(notes), details, as_motion(found))
 
 
 def _full_ml(case: BreathCase, scan: Scan, at_scan: tuple[float, int], direction: str, notes: list[str]) -> float:
@@ -84,7 +90,8 @@ def _full_ml(case: BreathCase, scan: Scan, at_scan: tuple[float, int], direction
         notes.append(f"The depth of the breath is not known; {tidal:.0f} ml, a quiet breath's, are taken.")
     else:
         full = sum(_ml(mask) for mask in masks_of(other).lungs.values())
-        notes.append(f"Of the {other.name} the volume alone was taken, {full:.0f} ml, as the depth of the breath.")
+        if case.images is None:
+            notes.append(f"Of the {other.name} the volume alone was taken, {full:.0f} ml, as the depth of the breath.")
     kept = float(np.clip(full, LEAST * start, MOST * start))
     if kept != full:
         notes.append(f"The breath was limited to {kept:.0f} ml of {start:.0f} ml at the scan, from {full:.0f} ml.")

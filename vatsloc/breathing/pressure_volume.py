@@ -13,17 +13,18 @@ from typing import Any
 import numpy as np
 
 from poro.arrays import Array
-from poro.breathing.cavity import Inflating, inflating
-from poro.breathing.elastic import acting_at
+from poro.breathing.cavity import TISSUE, Inflating, inflating
+from poro.breathing.elastic import WALL_ALONE, acting_at
 from poro.breathing.inflation import fill
 from poro.breathing.mesh_quality import Shares, smooth, violations
-from poro.breathing.pressure_volume import pressure_volume
+from poro.breathing.pressure_volume import pressure_volume, recoil_pa
 from vatsloc.breathing.case import BreathCase
 from vatsloc.breathing.lungs import both_scans
 from vatsloc.breathing.motion import IN, LungMotion, Motion, between, shares
+from vatsloc.breathing.registered import as_motion, register
 
 EDGE_MM = 16.0
-EQUILIBRIA = 5
+EQUILIBRIA = 3
 """How many are computed; phases between lie on a line from one to the next."""
 FULL = 0.99
 """Share of the way to the inspired volume at which the lung stops: corners of the cavity it would only fill at any
@@ -36,17 +37,23 @@ def drive(case: BreathCase, count: int, say: Callable[[str], None]) -> Motion:
     progress = shares(count)
     knots = shares(min(count, EQUILIBRIA + 1))
     lungs, pressures, quality = [], [], []
-    for pair in pairs:
+    found = register(case, pairs, say)
+    for number, pair in enumerate(pairs):
         say(f"{pair.side} lung: {len(knots) - 1} equilibria of its inflation ...")
-        scene = inflating(pair.lung, acting_at(pair.depth))
-        found = list(fill(scene.at, knots[1:].tolist(), partial(_volume, scene), scene.guess))
-        u = np.stack([np.zeros_like(scene.mesh.points), *(phase.u for phase in found)])
+        # What acts is supposed of a lung of which shapes alone are known.
+        scene = (
+            inflating(pair.lung, acting_at(pair.depth))
+            if found is None
+            else inflating(pair.lung, WALL_ALONE, found[number].inward())
+        )
+        phases = list(fill(scene.at, knots[1:].tolist(), partial(_volume, scene), scene.guess))
+        u = np.stack([np.zeros_like(scene.mesh.points), *(phase.u for phase in phases)])
         states = tuple(scene.mesh.points + between(u, knots, s) for s in progress)
         lungs.append(LungMotion(pair.side, scene.mesh, states))
-        pressures.append(np.interp(progress, knots, [0.0, *(1000 * phase.transpulmonary_kpa for phase in found)]))
+        pressures.append([recoil_pa(scene.mesh, nodes, TISSUE) for nodes in states])
         quality.append((pair.side, violations(scene.mesh), violations(smooth(scene.mesh))))
-        if not all(phase.settled for phase in found):
-            slow = sum(not phase.settled for phase in found)
+        if not all(phase.settled for phase in phases):
+            slow = sum(not phase.settled for phase in phases)
             notes.append(f"{pair.side} lung: {slow} of {len(knots) - 1} equilibria still moved by over 0.3 mm a step.")
     by_tissue = np.mean(pressures, axis=0)
     volumes = np.array([sum(lung.volume_ml(n) for lung in lungs) for n in range(count)])
@@ -57,7 +64,7 @@ def drive(case: BreathCase, count: int, say: Callable[[str], None]) -> Motion:
         "tables": [_pressures(volumes, curve, stiffness * by_tissue), _quality(quality)],
     }
     pressure = tuple(float(p) for p in stiffness * by_tissue)
-    return Motion("pressure-volume", IN, tuple(lungs), pressure, count - 1, tuple(notes), details)
+    return Motion("pressure-volume", IN, tuple(lungs), pressure, count - 1, tuple(notes), details, as_motion(found))
 
 
 def _volume(scene: Inflating, share: float) -> float:

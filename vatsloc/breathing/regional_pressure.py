@@ -21,6 +21,7 @@ from poro.mesh.tetmesh import signed_volumes
 from vatsloc.breathing.case import BreathCase
 from vatsloc.breathing.lungs import Pair, both_scans
 from vatsloc.breathing.motion import IN, LungMotion, Motion, between, shares
+from vatsloc.breathing.registered import as_motion, register
 from vatsloc.breathing.score import read_landmarks
 from vatsloc.errors import InputRefused
 
@@ -31,13 +32,17 @@ SEEN = "E2: the fit has seen the landmarks that score it; its error at them tell
 def drive(case: BreathCase, count: int, say: Callable[[str], None], see_landmarks: bool = False) -> Motion:
     """From expiration to inspiration in `count` states; see_landmarks: the paper's experiment E2."""
     pairs, notes = both_scans(case, EDGE_MM)
+    found = None if see_landmarks else register(case, pairs, say)
     lungs, pressures, rows = [], [], []
-    for pair in pairs:
+    for number, pair in enumerate(pairs):
         try:
             scene = thorax(pair.expired.inside, pair.expired.ras_from_ijk, pair.lung, acting_at(pair.depth))
         except ValueError as refusal:
             raise InputRefused(f"No chest can be built about the {pair.side} lung: {refusal}.") from refusal
         matched = _matched(case, pair) if see_landmarks else None
+        if found is not None:
+            known = found[number]
+            matched = locate(pair.lung.expired, known.expired), known.expired, known.inspired.points
         fit = fit_pressures(scene, pair.lung.inspired.boundary, matched, partial(_say, say, pair.side))
         say(f"{pair.side} lung: {count - 1} states of the fitted pressures ...")
         states = states_of(scene, fit.state.p, fit.state.u, count)
@@ -53,7 +58,7 @@ def drive(case: BreathCase, count: int, say: Callable[[str], None], see_landmark
         details["saw_landmarks"] = True
     mean = float(np.mean(pressures))
     pressure = tuple(float(s * mean) for s in shares(count))
-    return Motion("regional-pressure", IN, tuple(lungs), pressure, count - 1, tuple(notes), details)
+    return Motion("regional-pressure", IN, tuple(lungs), pressure, count - 1, tuple(notes), details, as_motion(found))
 
 
 def _say(say: Callable[[str], None], side: str, text: str) -> None:

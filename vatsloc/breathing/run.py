@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -18,9 +20,10 @@ from poro.mesh.tetmesh import signed_volumes
 from vatsloc.breathing.case import BreathCase, read_breath
 from vatsloc.breathing.film import animated, as_png, frames
 from vatsloc.breathing.images import write_images
-from vatsloc.breathing.motion import Motion
+from vatsloc.breathing.motion import Motion, along
 from vatsloc.breathing.page import Strip, Table, page
 from vatsloc.breathing.score import score
+from vatsloc.breathing.signal import sampled
 from vatsloc.errors import CaseError
 from vatsloc.formats.folder import PROGRAM, whole_folder
 from vatsloc.formats.meshes import TetraMesh, write_vtu
@@ -35,21 +38,30 @@ DRIVERS: Mapping[str, Drive] = {
 """How a breath is driven, by the name on the command line: one room's module per paper."""
 RESULT, PAGE = "breath.json", "breath.html"
 STATES = (2, 200)
+WAY = 11
+"""States of the way between two scans, when a breath goes there and back along it."""
 
 
 def breathe_case(
-    folder: Path, out: Path, driver: str, count: int, say: Callable[[str], None], see_landmarks: bool = False
+    folder: Path,
+    out: Path,
+    driver: str,
+    count: int,
+    say: Callable[[str], None],
+    see_landmarks: bool = False,
+    masks_alone: bool = False,
 ) -> dict[str, Any]:
     """Drive the lungs of a folder through `count` states and write them to `out`. Returns what `--json` prints.
 
-    see_landmarks: the fit of regional pressures may see the landmarks too, and says so.
+    see_landmarks: the fit of regional pressures may see the landmarks too, and says so; masks_alone: two images, where
+    there are, are not registered.
     """
     if driver not in DRIVERS:
         raise CaseError(f"{driver!r} is no driver; take {', '.join(DRIVERS)}.")
     if not STATES[0] <= count <= STATES[1]:
         raise CaseError(f"--states {count} is out of range; ask for {STATES[0]} to {STATES[1]}.")
     began = perf_counter()
-    case = read_breath(folder)
+    case = replace(read_breath(folder), masks_alone=masks_alone)
     with whole_folder(out, (RESULT, PAGE), is_breath) as partial:
         motion = run_driver(case, driver, count, say, see_landmarks)
         seconds = perf_counter() - began
@@ -62,6 +74,7 @@ def breathe_case(
                 {"volume_ml": motion.volume_ml(n), "pressure_pa": motion.pressure_pa[n]} for n in range(motion.count)
             ],
             "landmarks": score(motion, case.landmarks),
+            "registration": None if motion.registered is None else score(motion.registered, case.landmarks),
             "warnings": list(motion.warnings),
             **motion.details,
         }
@@ -85,12 +98,17 @@ def breathe_case(
 def run_driver(
     case: BreathCase, driver: str, count: int, say: Callable[[str], None], see_landmarks: bool = False
 ) -> Motion:
-    """The motion of a case by a driver's name."""
-    if not see_landmarks:
-        return DRIVERS[driver](case, count, say)
-    if driver != "regional-pressure":
-        raise CaseError(f"--fit-landmarks is an experiment of regional-pressure; leave it out with {driver}.")
-    return regional_pressure.drive(case, count, say, see_landmarks=True)
+    """The motion of a case by a driver's name: `count` states from scan to scan, or along the case's signal."""
+    drive = DRIVERS[driver]
+    if see_landmarks:
+        if driver != "regional-pressure":
+            raise CaseError(f"--fit-landmarks is an experiment of regional-pressure; leave it out with {driver}.")
+        drive = partial(regional_pressure.drive, see_landmarks=True)
+    if case.signal is None or driver == "one-scan":  # which follows a signal by itself
+        return drive(case, count, say)
+    t, volume = sampled(case.signal, count)
+    motion = along(drive(case, WAY, say), volume)
+    return replace(motion, details={**motion.details, "time_s": t.tolist(), "signal": volume.tolist()})
 
 
 def is_breath(folder: Path) -> bool:

@@ -153,7 +153,7 @@ def bench_real_command(
 
 @bench.command("breathe")
 def bench_breathe_command(
-    cases: Annotated[list[Path], typer.Argument(metavar="CASE...", help="Breathing cases with landmarks.")],
+    cases: Annotated[list[Path], typer.Argument(metavar="CASE...", help="Breathing cases with landmarks, or series.")],
     drivers: Annotated[str | None, typer.Option(metavar="A,B,..", help="Drivers; all by default.")] = None,
     as_json: JsonOption = False,
 ) -> None:
