@@ -274,10 +274,11 @@ def _contact(scene: Thorax, u: Array) -> ConstraintTerms:
 def _patch_forces(scene: Thorax, u: Array) -> Array:
     """Nodal forces (n, 3, k) kPa mm2 per kPa of every patch, pulling the walls away from the lung."""
     walls = scene.moved_walls(u)
-    forces = np.zeros((len(walls.points), 3, scene.patches))
+    forces = np.zeros((len(walls.points), scene.patches, 3))
     for corner in range(3):
-        np.add.at(forces, (walls.triangles[:, corner], slice(None), scene.patch), walls.area_vectors / 3)
-    return np.asarray((scene.carried.T @ forces.reshape(len(walls.points), -1)).reshape(len(u), 3, -1))
+        np.add.at(forces, (walls.triangles[:, corner], scene.patch), walls.area_vectors / 3)
+    carried = (scene.carried.T @ forces.reshape(len(walls.points), -1)).reshape(len(u), scene.patches, 3)
+    return np.asarray(np.moveaxis(carried, 1, 2))
 
 
 def _carried(walls: TriSurface, bodies: Sequence[TetMesh], lung_nodes: int) -> tuple[csr_matrix, Array]:

@@ -199,3 +199,16 @@ def test_a_match_counts_where_two_of_its_neighbours_move_alike() -> None:
     motion[[4, 17]] += [[0, 9.0, 0], [0, 7.0, 0]]
     kept = module._consistent(Correspondences.of(at, at - motion, np.ones(20)))
     assert_array_equal(np.setdiff1d(at[:, 0], kept.fixed[:, 0]), [4])
+
+
+def test_other_places_lie_to_all_sides_of_the_model_and_are_smaller_and_larger() -> None:
+    rest = np.random.default_rng(3).normal(0, 40, (50, 3))
+    after = 0.8 * rest + [5.0, -7.0, 2.0]
+    others = [rest + other for other in module._others(rest, after - rest)]
+    moved = np.array([other.mean(axis=0) - after.mean(axis=0) for other in others])
+    sides = 12.0 * np.concatenate([np.eye(3), -np.eye(3)])
+    assert_allclose(moved, np.concatenate([sides, np.zeros((2, 3))]), atol=1e-9)
+    spread = [
+        np.linalg.norm(other - other.mean(axis=0)) / np.linalg.norm(after - after.mean(axis=0)) for other in others
+    ]
+    assert_allclose(spread, [1.0] * 6 + [0.85, 1.15])

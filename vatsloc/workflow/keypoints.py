@@ -69,8 +69,8 @@ def find_correspondences(
 
 
 def _others(rest: Array, displacement: Array) -> list[Array]:
-    """Displacements (n, 3) mm of nodes at rest (n, 3) that put the collapsed lung aside of the model, or make it more or
-    less collapsed.
+    """Displacements (n, 3) mm of nodes at rest (n, 3) that put the collapsed lung aside of the model, or make it
+    smaller or larger.
     """
     shifts = SHIFT_MM * np.concatenate([np.eye(3), -np.eye(3)])
     after = rest + displacement

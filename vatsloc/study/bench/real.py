@@ -18,7 +18,7 @@ from vatsloc.errors import InputRefused
 from vatsloc.evaluation.statistics import distances, summarize
 from vatsloc.frames import Side
 from vatsloc.study.bench.breaths import Marks, read_person
-from vatsloc.study.bench.real_images import has_images, registered
+from vatsloc.study.bench.real_images import registered
 from vatsloc.study.bench.real_images import table as images_table
 from vatsloc.study.bench.spoilt_masks import SPOILT
 
@@ -122,7 +122,7 @@ def measure(folder: Path, say: Callable[[str], None]) -> dict[str, Any]:
         "seconds": seconds,
         "back": _way("expiration to inspiration", back),
         "images": {p.side: registered(person.case, p, nodes[p.side], say) for p in person.pairs}
-        if has_images(person.case)
+        if person.case.images is not None
         else None,
         "notes": list(person.notes),
     }

@@ -29,12 +29,6 @@ PEER_VOXEL_MM = 2.0
 _WORDS = {"motion": "motion", "there_and_back": "there and back", "elastix": "elastix off by"}
 
 
-def has_images(case: BreathCase) -> bool:
-    """Whether both states come with an image."""
-    scans = (case.inspiration, case.expiration)
-    return all(scan is not None and scan.image is not None for scan in scans)
-
-
 def registered(
     case: BreathCase, pair: Pair, predictions: dict[str, Array], say: Callable[[str], None] = lambda _: None
 ) -> dict[str, Any]:
