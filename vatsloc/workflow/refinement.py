@@ -205,9 +205,8 @@ def _off_wall(shape: Shape) -> tuple[Array, Array, Array]:
     gap = np.einsum("nd,nd->n", off, normals)
     facing = np.einsum("nd,nd->n", border.node_normals, normals) > WALL_ALONG
     near = facing & (np.abs(gap) < WALL_REACH_MM) & (np.linalg.norm(off, axis=1) < WALL_REACH_MM + SPACING_MM)
-    if not near.any():
-        return np.zeros(0, dtype=int), np.zeros(0), np.zeros((0, 3))
-    return border.nodes[near], gap[near] - np.median(gap[near]), normals[near]
+    shared = np.median(gap[near]) if near.any() else 0.0
+    return border.nodes[near], gap[near] - shared, normals[near]
 
 
 def unfolded(points: Array, field: Array, tets: Array) -> Array:
