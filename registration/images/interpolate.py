@@ -37,6 +37,18 @@ def _values(voxels, points, fill, out, start, stop):
 
 
 @njit(cache=True, nogil=True)
+def _affine_values(voxels, affine, fill, out, start, stop):
+    points = np.empty((out.shape[2], 3))
+    for p in range(start, stop):
+        for q in range(out.shape[1]):
+            for m in range(3):
+                first = affine[m, 0] * p + affine[m, 1] * q + affine[m, 3]
+                for r in range(out.shape[2]):
+                    points[r, m] = first + affine[m, 2] * r
+            _values(voxels, points, fill, out[p, q], 0, out.shape[2])
+
+
+@njit(cache=True, nogil=True)
 def _warp(voxels, base, displacement, index, ijk_from_ras, out, start, stop):
     ni, nj, nk = voxels.shape
     for n in range(start, stop):
@@ -80,4 +92,15 @@ def interpolate(voxels: Array, grid: Grid, points_ras: Array, fill: float) -> Ar
     points = np.ascontiguousarray(grid.to_ijk(np.asarray(points_ras, dtype=float)))
     out = np.empty(len(points), dtype=np.float32)
     in_parts(partial(_values, _checked(voxels), points, np.float32(fill), out), len(points), MANY_POINTS)
+    return out
+
+
+def interpolate_affine(voxels: Array, ijk_from_voxel: Array, shape: tuple[int, int, int], fill: float) -> Array:
+    """As `interpolate`, at all voxels of a grid of `shape`, float32. ijk_from_voxel: (4, 4), from its indices to those
+    of the image.
+    """
+    out = np.empty(shape, dtype=np.float32)
+    in_parts(
+        partial(_affine_values, _checked(voxels), np.ascontiguousarray(ijk_from_voxel), np.float32(fill), out), shape[0]
+    )
     return out

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from registration.images.interpolate import interpolate
+from registration.images.interpolate import EDGE, interpolate, interpolate_affine
 from registration.kernels.banded import Banded, along_axes
 from registration.maps.field import DisplacementField, PointMap, slabs
+from registration.maps.rigid import RigidTransform
 from registration.volume import Array, Grid, Mask, Volume
 
 
@@ -61,13 +62,41 @@ def _filtered(volume: Volume, grid: Grid, sigma_mm: Array) -> Volume:
 def _sampled(voxels: Array, source: Grid, target: Grid, mapping: PointMap | None, fill: float) -> Array:
     if mapping is None and source.same_as(target):
         return np.array(voxels, dtype=np.float32)
+    voxels = np.ascontiguousarray(voxels, dtype=np.float32)
+    if mapping is None or isinstance(mapping, RigidTransform):
+        moved = target.ras_from_ijk if mapping is None else mapping.matrix @ target.ras_from_ijk
+        ijk_from_target = source.ijk_from_ras @ moved
+        if _is_diagonal(ijk_from_target[:3, :3], target.shape):
+            return _along_axes(voxels, np.diag(ijk_from_target), ijk_from_target[:3, 3], target.shape, fill)
+        return interpolate_affine(voxels, ijk_from_target, target.shape, fill)
     if isinstance(mapping, DisplacementField) and mapping.grid.same_as(target):
         displacement = mapping.vectors
-        moved = (p + displacement[i].reshape(-1, 3) for i, p in enumerate(slabs(target)))
+        points = (p + displacement[i].reshape(-1, 3) for i, p in enumerate(slabs(target)))
     else:
-        moved = (p if mapping is None else mapping(p) for p in slabs(target))
-    voxels = np.ascontiguousarray(voxels, dtype=np.float32)
+        points = (mapping(p) for p in slabs(target))
     out = np.empty(target.shape, dtype=np.float32)
-    for i, points in enumerate(moved):
-        out[i] = interpolate(voxels, source, points, fill).reshape(target.shape[1:])
+    for i, slab in enumerate(points):
+        out[i] = interpolate(voxels, source, slab, fill).reshape(target.shape[1:])
+    return out
+
+
+def _is_diagonal(linear: Array, shape: tuple[int, int, int]) -> bool:
+    """Whether the axes of two grids are parallel: what else a matrix does is below EDGE over a grid of `shape`."""
+    across = np.abs(linear - np.diag(np.diag(linear))) * shape
+    return bool(across.sum(axis=1).max() < EDGE)
+
+
+def _along_axes(voxels: Array, scale: Array, shift: Array, shape: tuple[int, int, int], fill: float) -> Array:
+    """Trilinear values on a parallel grid, whose voxel i lies at scale i + shift of the image: axis by axis."""
+    if 0 in shape:
+        return np.zeros(shape, np.float32)
+    matrices, beyond = [], []
+    for m, n in enumerate(voxels.shape):
+        at = scale[m] * np.arange(shape[m]) + shift[m]
+        beyond.append((at < -EDGE) | (at > n - 1 + EDGE))
+        off = np.abs(np.clip(at, 0, n - 1)[:, None] - np.arange(n))
+        matrices.append(Banded(np.maximum(1 - off, 0)))
+    out = along_axes(voxels[None], matrices)[0]
+    for m, rows in enumerate(beyond):
+        out[(slice(None),) * m + (rows,)] = fill
     return out

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy import ndimage
 
 from registration.correspondences import Correspondences
+from registration.images.filters import gaussian
 from registration.keypoints.affine_matching import MaskedImage, match_affine_blocks
 from registration.keypoints.matching import moves_with_neighbours
 from registration.volume import Array, Mask, Volume
@@ -88,6 +88,7 @@ def match_aligned(
         starts,
         affines,
         round(settings.reach_mm / voxel),
+        settings.least_ncc,
     )
     holds = (found.ncc >= settings.least_ncc) & (found.round_trip * voxel <= settings.round_trip_mm)
     moved = expected.values + np.einsum("nij,nj->ni", per_voxel, found.shift)
@@ -103,8 +104,7 @@ def _within(image: Volume, region: Mask) -> MaskedImage:
     inside = region.inside.astype(np.float32)
     known = image.hu * inside
     fine, wide = (
-        ndimage.gaussian_filter(known, sigma, truncate=3.0)
-        / np.maximum(ndimage.gaussian_filter(inside, sigma, truncate=3.0), 1e-6)
+        gaussian(known, sigma, truncate=3.0) / np.maximum(gaussian(inside, sigma, truncate=3.0), 1e-6)
         for sigma in (BLUR_VOXELS, CONTINUED_VOXELS)
     )
     return MaskedImage(np.where(region.inside, fine, wide).astype(np.float32), region.inside)

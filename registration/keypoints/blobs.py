@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
+from registration.images.filters import gaussian
 from registration.images.morphology import bounding_box
 from registration.volume import Array
 
@@ -50,6 +51,6 @@ def _hessian(hu: Array, sigma: float, inside: Array) -> Array:
             order = [0, 0, 0]
             order[a] += 1
             order[b] += 1
-            smooth = ndimage.gaussian_filter(hu, sigma, order=order, truncate=TRUNCATED)
+            smooth = gaussian(hu, sigma, order=order, truncate=TRUNCATED)
             hessian[:, a, b] = hessian[:, b, a] = smooth[inside]
     return hessian

@@ -15,6 +15,7 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from registration.correspondences import Correspondences
+from registration.images.filters import gaussian
 from registration.images.resample import resample, resample_mask
 from registration.kernels.correlation import coefficient
 from registration.kernels.threads import in_parts
@@ -113,7 +114,7 @@ def distinctiveness(hu: Array, spacing: Array) -> Array:
     Ref: Foerstner & Guelch 1987.
     """
     slope = np.gradient(hu.astype(np.float32), *spacing)
-    t = {(a, b): ndimage.gaussian_filter(slope[a] * slope[b], 1.4) for a in range(3) for b in range(a, 3)}
+    t = {(a, b): gaussian(slope[a] * slope[b], 1.4) for a in range(3) for b in range(a, 3)}
     xx, yy, zz, xy, xz, yz = t[0, 0], t[1, 1], t[2, 2], t[0, 1], t[0, 2], t[1, 2]
     minors = (yy * zz - yz**2) + (xx * zz - xz**2) + (xx * yy - xy**2)
     det = xx * (yy * zz - yz**2) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
@@ -122,7 +123,7 @@ def distinctiveness(hu: Array, spacing: Array) -> Array:
 
 def smoothed(volume: Volume) -> Volume:
     """The image blurred by half a voxel, as all blocks are compared."""
-    return Volume(ndimage.gaussian_filter(volume.hu, 0.5), volume.ras_from_ijk)
+    return Volume(gaussian(volume.hu, 0.5), volume.ras_from_ijk)
 
 
 def detect_keypoints(image: Volume, allowed: Array, settings: MatchSettings) -> Array:
@@ -155,7 +156,7 @@ def _match_blocks(fixed: Volume, moving: Volume, starts: Array, search: _Search)
     if not n:
         return np.zeros((0, 3)), np.zeros(0)
     level = np.float32(moving.hu.mean(dtype=float))
-    f, m = (_Scales(hu, ndimage.gaussian_filter(hu, BLUR_VOXELS)) for hu in (fixed.hu - level, moving.hu - level))
+    f, m = (_Scales(hu, gaussian(hu, BLUR_VOXELS)) for hu in (fixed.hu - level, moving.hu - level))
     starts = np.ascontiguousarray(starts, np.int64)
     in_parts(partial(_match_all, f, m, starts, search, shifts, around), len(starts))
     offset, is_peak = subvoxel_peak(around)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy import ndimage
 
+from registration.images.filters import gaussian
 from registration.images.morphology import bounding_box
+from registration.images.resample import resample
 from registration.volume import Array, Grid, Mask, Volume
 from vatsloc.frames import reorient
 
@@ -30,28 +31,15 @@ def working_copy(volume: Volume, spacing_mm: float) -> Volume:
 
 def on_grid(inside: Array, source: Grid, target: Grid, smooth_mm: float = 0.0) -> Mask:
     """A working mask on `target`: trilinear membership of at least one half, first smoothed by `smooth_mm`."""
-    membership = inside.astype(np.float32)
-    if smooth_mm > 0:
-        membership = ndimage.gaussian_filter(membership, smooth_mm / source.spacing, mode="nearest")
     out = np.zeros(target.shape, dtype=bool)
     if inside.any():
-        box = bounding_box(inside, np.full(3, 2))
-        lower, upper = np.array([[b.start - 2.0, b.stop + 1.0] for b in box]).T
-        corners = lower + np.array([[a, b, c] for a in (0, 1) for b in (0, 1) for c in (0, 1)]) * (upper - lower)
-        ijk = target.to_ijk(source.to_ras(corners))
-        lo = np.clip(np.floor(ijk.min(axis=0)), 0, target.shape).astype(int)
-        part = target.box(lo, np.maximum(ijk.max(axis=0) + 1, lo))
-        step = source.ijk_from_ras @ part.ras_from_ijk
-        linear = step[:3, :3]
-        aligned = np.allclose(linear, np.diag(np.diag(linear)))
-        value = ndimage.affine_transform(
-            membership,
-            np.diag(linear) if aligned else linear,
-            step[:3, 3],
-            part.shape,
-            order=1,
-            mode="constant",
-            prefilter=False,
-        )
-        out[tuple(slice(a, a + n) for a, n in zip(lo, part.shape, strict=True))] = value >= 0.5
+        box = bounding_box(inside, np.ceil(4 * smooth_mm / source.spacing) + 2)
+        membership, near = inside[box].astype(np.float32), source.part(box)
+        if smooth_mm > 0:
+            membership = gaussian(membership, smooth_mm / source.spacing, mode="nearest")
+        corners = np.array([[a, b, c] for a in (0, 1) for b in (0, 1) for c in (0, 1)]) * (np.array(near.shape) - 1)
+        ijk = target.to_ijk(near.to_ras(corners.astype(float)))
+        lower, upper = np.floor(ijk.min(axis=0)), ijk.max(axis=0) + 1
+        on_part = resample(Volume(membership, near.ras_from_ijk), target.box(lower, upper), fill=0.0)
+        out[target.cut(lower, upper)] = on_part.hu >= 0.5
     return Mask(out, target.ras_from_ijk)

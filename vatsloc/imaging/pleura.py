@@ -8,6 +8,7 @@ import numpy as np
 from scipy import ndimage
 from skimage.segmentation import watershed
 
+from registration.images.filters import gaussian
 from registration.images.morphology import bounding_box, close, dilate, erode
 from registration.volume import Array, Grid, Mask, Volume
 from vatsloc.imaging.airways import TrackedAirways
@@ -62,7 +63,7 @@ def find_pneumothorax(cbct: PreparedCbct, prior: ThoraxPrior) -> Pneumothorax:
     work, seen = working_scene(cbct)
     space, airways = lung_space(work, seen, prior)
     whole = working_copy(cbct.volume, FINE_MM)
-    whole = Volume(ndimage.gaussian_filter(whole.hu, SMOOTHING_MM / whole.grid.spacing), whole.ras_from_ijk)
+    whole = Volume(gaussian(whole.hu, SMOOTHING_MM / whole.grid.spacing), whole.ras_from_ijk)
     near = on_grid(dilate(space, 2.5, work.grid.spacing) & seen, work.grid, whole.grid).inside
     box = bounding_box(near, np.full(3, 3)) if near.any() else (slice(0, 1),) * 3
     part = whole.grid.box(np.array([b.start for b in box]), np.array([b.stop for b in box]))
@@ -145,7 +146,7 @@ def _flooded(work: Volume, space: Array, sure: Array, limit: float) -> Array:
     Shading shifts HU slowly, so that an edge tells better than a level. Ref: Vincent & Soille 1991.
     """
     box = bounding_box(space, np.full(3, 2))
-    hu = ndimage.gaussian_filter(np.clip(work.hu[box], -1024, AERATED_HU), 0.4)
+    hu = gaussian(np.clip(work.hu[box], -1024, AERATED_HU), 0.4)
     edge = ndimage.gaussian_gradient_magnitude(hu, 0.6)
     markers = np.where(sure[box], 1, np.where(space[box] & (hu > limit), 2, 0)).astype(np.int32)
     out = np.zeros_like(space)
@@ -160,10 +161,8 @@ def _local_limit(work: Volume, space: Array, air: Array, limit: float, contrast:
     core = erode(air, 2.0, spacing)
     sums = []
     for part, far in ((core, limit - contrast / 2), (lung, limit + contrast / 2)):
-        weight = ndimage.gaussian_filter(part.astype(np.float32), SHADING_MM / spacing) + 0.01
-        total = (
-            ndimage.gaussian_filter(np.where(part, work.hu, 0).astype(np.float32), SHADING_MM / spacing) + 0.01 * far
-        )
+        weight = gaussian(part.astype(np.float32), SHADING_MM / spacing) + 0.01
+        total = gaussian(np.where(part, work.hu, 0).astype(np.float32), SHADING_MM / spacing) + 0.01 * far
         sums.append(total / weight)
     return (sums[0] + sums[1]) / 2
 

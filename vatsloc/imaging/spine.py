@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
+from registration.images.filters import gaussian
 from registration.images.morphology import close, dilate
 from registration.volume import Array, Mask, Volume
 from vatsloc.errors import InputRefused
@@ -67,7 +68,7 @@ def segment_spine(image: Volume, usable: Mask | None = None) -> Spine:
         )
     path = _column(work, excess, seen, slices)
     region = _around(path, work, slices) & seen
-    bone = ndimage.gaussian_filter(excess, 0.5) > 0
+    bone = gaussian(excess, 0.5) > 0
     vertebrae = _joined_to_column(bone & region, path, slices, spacing)
     if vertebrae.sum() * spacing.prod() / 1000 < 0.5 * slices.size * spacing[2]:
         raise InputRefused(
@@ -100,8 +101,8 @@ def _column(work: Volume, excess: Array, seen: Array, slices: Array) -> Array:
     """
     spacing = work.grid.spacing
     sigma = BODY_RADIUS_MM / 2 / spacing
-    density = ndimage.gaussian_filter(excess, (sigma[0], sigma[1], 2 * sigma[2]))[:, :, slices]
-    weight = ndimage.gaussian_filter(seen.astype(np.float32), (sigma[0], sigma[1], 0))[:, :, slices]
+    density = gaussian(excess, (sigma[0], sigma[1], 2 * sigma[2]))[:, :, slices]
+    weight = gaussian(seen.astype(np.float32), (sigma[0], sigma[1], 0))[:, :, slices]
     density = density / np.maximum(weight, 0.8)
     density /= max(float(density.max()), 1e-6)
     density = density - _too_far_front(work)[:, :, slices]

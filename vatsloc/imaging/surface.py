@@ -9,6 +9,7 @@ import numpy as np
 from scipy import ndimage
 from skimage.measure import marching_cubes
 
+from registration.images.filters import gaussian
 from registration.images.interpolate import interpolate
 from registration.images.morphology import bounding_box
 from registration.volume import Array, Mask, Volume
@@ -112,7 +113,7 @@ def _on_mask(mask: Mask, spacing_mm: float) -> tuple[Array, Array]:
         return np.empty((0, 3)), np.empty((0, 3))
     spacing = mask.grid.spacing
     box = bounding_box(mask.inside, np.full(3, 4))
-    level = ndimage.gaussian_filter(mask.inside[box].astype(np.float32), 1.0 / spacing)
+    level = gaussian(mask.inside[box].astype(np.float32), 1.0 / spacing)
     level = np.pad(level, 1)
     if not level.max() > 0.5:
         return np.empty((0, 3)), np.empty((0, 3))
@@ -121,7 +122,7 @@ def _on_mask(mask: Mask, spacing_mm: float) -> tuple[Array, Array]:
     cell = np.floor(vertices * spacing / spacing_mm).astype(np.int64)
     _, first = np.unique(cell @ np.array([1, 1 << 20, 1 << 40]), return_index=True)
     vertices = vertices[np.sort(first)]
-    wide = ndimage.gaussian_filter(level, 1.5 / spacing)
+    wide = gaussian(level, 1.5 / spacing)
     rotation = mask.ras_from_ijk[:3, :3] / spacing
     slope = np.stack([ndimage.map_coordinates(g, vertices.T, order=1) for g in np.gradient(wide, *spacing)], axis=1)
     normals = -slope @ rotation.T
