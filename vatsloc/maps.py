@@ -58,7 +58,7 @@ def sampled(mapping: MeshMap, grid: Grid, beyond_mm: float = np.inf) -> Displace
     that, and farther off not at all; either is far cheaper than the nearest point of the surface.
     """
     rigid = sample_map(mapping.around, grid).vectors
-    box, cut = _box_of(mapping.mesh, grid)
+    box, cut = box_of(mapping.mesh, grid)
     relative = np.zeros((*grid.shape, 3), dtype=np.float32)
     relative[cut], inside = rasterize(mapping.mesh, mapping.relative, box.ijk_from_ras, box.shape)
     if beyond_mm > 0 and inside.any():
@@ -72,13 +72,13 @@ def sampled(mapping: MeshMap, grid: Grid, beyond_mm: float = np.inf) -> Displace
 
 def covered(mesh: TetMesh, grid: Grid) -> Mask:
     """Voxels whose centres lie in a mesh."""
-    box, cut = _box_of(mesh, grid)
+    box, cut = box_of(mesh, grid)
     inside = np.zeros(grid.shape, dtype=bool)
     inside[cut] = rasterize(mesh, np.zeros((len(mesh.points), 0)), box.ijk_from_ras, box.shape)[1]
     return Mask(inside, grid.ras_from_ijk)
 
 
-def _box_of(mesh: TetMesh, grid: Grid) -> tuple[Grid, tuple[slice, slice, slice]]:
+def box_of(mesh: TetMesh, grid: Grid) -> tuple[Grid, tuple[slice, slice, slice]]:
     """The part of a grid that a mesh can reach, and where it lies in the grid."""
     ijk = grid.to_ijk(mesh.points)
     lower, upper = ijk.min(axis=0) - 1, ijk.max(axis=0) + 2

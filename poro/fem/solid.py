@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from scipy.sparse import csr_matrix
@@ -10,7 +11,8 @@ from scipy.sparse import csr_matrix
 from poro.arrays import Array
 from poro.fem.forms import stiffness
 from poro.fem.tissue import Tissue
-from poro.linalg.solver import LinearSolver, linear_solver, solve_once
+from poro.linalg.dissection import Tree
+from poro.linalg.solver import LinearSolver, elimination_tree, linear_solver, solve_once
 from poro.mesh.tetmesh import TetMesh
 
 
@@ -72,4 +74,10 @@ def constrained(mesh: TetMesh, tissue: Tissue, constraints: csr_matrix, force: A
     hold. Raises SolverError when they do not suffice.
     """
     matrix = (stiffness(mesh, tissue.lame_kpa, tissue.shear_kpa) + constraints).tocsr()
-    return solve_once(matrix, mesh.points, force.ravel()).reshape(-1, 3)
+    return solve_once(matrix, mesh.points, force.ravel(), _tree(mesh, tissue)).reshape(-1, 3)
+
+
+@lru_cache(maxsize=1)
+def _tree(mesh: TetMesh, tissue: Tissue) -> Tree:
+    """The stiffness alone tells it: a point constraint couples only what its tetrahedron does."""
+    return elimination_tree(stiffness(mesh, tissue.lame_kpa, tissue.shear_kpa), mesh.points)

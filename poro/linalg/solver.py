@@ -134,10 +134,10 @@ def multigrid(matrix: csr_matrix, points: Array) -> Multigrid:
     return Multigrid(blocked, hierarchy)
 
 
-def solve_once(matrix: csr_matrix, points: Array, right: Array) -> Array:
-    """Solution of one right-hand side (n,), to a relative residual of 1e-10; a matrix as of `linear_solver`."""
+def solve_once(matrix: csr_matrix, points: Array, right: Array, tree: Tree | None = None) -> Array:
+    """Solution of one right-hand side (n,), to a relative residual of 1e-10; matrix and tree as of `linear_solver`."""
     block = matrix.shape[0] // len(points)
-    tree = elimination_tree(matrix, points)
+    tree = tree or elimination_tree(matrix, points)
     try:
         if tree.factor_entries(block) > ONCE_LIMIT:
             return multigrid(matrix, points).solve(right)

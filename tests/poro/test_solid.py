@@ -209,6 +209,19 @@ def test_a_factor_in_single_precision_leads_to_the_same_answer() -> None:
     assert_allclose(solve_once(anchored.tocsr(), mesh.points, right), exact, rtol=0, atol=1e-9 * np.abs(exact).max())
 
 
+def test_multigrid_leads_to_the_same_answer_and_to_the_same_bits_every_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    mesh = ellipsoid(8.0)
+    anchored = (stiffness(mesh, TISSUE.lame_kpa, TISSUE.shear_kpa) + 1e-3 * identity(3 * len(mesh.points))).tocsr()
+    right = np.random.default_rng(0).normal(size=3 * len(mesh.points))
+    exact = solve_once(anchored, mesh.points, right)
+    monkeypatch.setattr(poro.linalg.solver, "ONCE_LIMIT", 0)
+    found = solve_once(anchored, mesh.points, right)
+    assert_allclose(found, exact, rtol=0, atol=1e-7 * np.abs(exact).max())
+    assert not np.array_equal(found, exact)
+    np.random.seed(1)  # noqa: NPY002 - the generator that pyamg's own defaults draw from
+    assert np.array_equal(found, solve_once(anchored, mesh.points, right))
+
+
 def test_where_single_precision_does_not_suffice_double_answers(monkeypatch: pytest.MonkeyPatch) -> None:
     mesh = ellipsoid(25.0)
     matrix = (stiffness(mesh, TISSUE.lame_kpa, TISSUE.shear_kpa) + identity(3 * len(mesh.points))).tocsr()

@@ -7,6 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
+from registration.images.interpolate import interpolate
 from registration.images.resample import coarsen, resample, resample_mask
 from registration.maps.field import DisplacementField, sample_map
 from registration.maps.rigid import RigidTransform
@@ -29,6 +30,26 @@ def test_a_linear_scene_survives_any_orientation_and_rigid_map(codes: str, tilt:
     move = RigidTransform.about(CENTRE, np.array([0.1, 0.2, -0.1]), np.array([4.0, -3.0, 5.0]))
     got = resample(moving, target, move)
     assert_allclose(got.hu.ravel(), linear(move(target.points().reshape(-1, 3))), atol=2e-3)
+
+
+@pytest.mark.parametrize("fill", [-1000.0, 0.0])
+def test_parallel_and_turned_grids_give_what_scattered_points_give(fill: float) -> None:
+    """Both have ways of their own; parts of the targets lie outside the image, some voxels exactly on its edge."""
+    moving = image_of(make_pattern(2), oriented("LAS", (30, 26, 28), 2.0, CENTRE))
+    parallel = oriented("RPS", (70, 33, 40), 1.0, CENTRE + np.array([0.5, 14.0, -9.0]))
+    for target in (parallel, tilted(parallel, TILT), moving.grid.with_spacing(np.array([1.0, 2.0, 0.5]))):
+        points = target.points().reshape(-1, 3)
+        want = interpolate(moving.hu, moving.grid, points, fill)
+        assert_allclose(resample(moving, target, fill=fill).hu.ravel(), want, atol=2e-3)
+        move = RigidTransform.about(CENTRE, np.array([0.0, 0.0, 0.3]), np.array([4.0, -3.0, 5.0]))
+        want = interpolate(moving.hu, moving.grid, move(points), fill)
+        assert_allclose(resample(moving, target, move, fill).hu.ravel(), want, atol=2e-3)
+    assert (want == fill).sum() > 100
+
+
+def test_a_grid_without_voxels_is_resampled_to_nothing() -> None:
+    moving = image_of(make_pattern(2), oriented("LAS", (8, 8, 8), 2.0, CENTRE))
+    assert resample(moving, Grid((0, 4, 4), np.diag([3.0, 3.0, 3.0, 1.0]))).hu.shape == (0, 4, 4)
 
 
 def test_oblique_round_trip_returns_the_scene() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -114,6 +115,43 @@ def test_stages_are_timed_and_refusals_named() -> None:
     stages.skip("three", "nothing to do")
     assert stages.skipped == {"three": "nothing to do"}
     assert said[-1] == "three: skipped, nothing to do"
+
+
+def test_what_was_begun_is_taken_by_its_own_stage_alone_and_what_fails_is_named_by_it() -> None:
+    stages, ran, gate = Stages(), [], threading.Event()
+
+    def begun(value: int) -> int:
+        assert gate.wait(10)
+        ran.append((value, threading.get_ident()))
+        return value
+
+    def failing() -> int:
+        raise InputRefused("no spine")
+
+    first = stages.begin("one", "CT", lambda: begun(1))
+    stages.begin("one", "deflated CBCT", lambda: begun(2))
+    stages.begin("two", "CT", failing)
+    with stages.stage("one", "inflated CBCT"):
+        assert stages.done(lambda: 3) == 3
+    assert ran == []
+    gate.set()
+    for image, value in (("deflated CBCT", 2), ("CT", 1)):
+        with stages.stage("one", image):
+            assert stages.done(lambda: 4) == value
+            assert stages.done(lambda: 4) == 4
+    assert first() == 1
+    assert [value for value, _ in ran] == [1, 2]
+    assert threading.get_ident() not in {thread for _, thread in ran}
+    with pytest.raises(InputRefused, match="no spine"), stages.stage("two", "CT"):
+        stages.done(lambda: 5)
+    gate.clear()
+    stages.begin("three", "", lambda: begun(6))
+    stages.begin("four", "", lambda: begun(7))
+    stages.forget()
+    gate.set()
+    with stages.stage("four"):
+        assert stages.done(lambda: 8) == 8
+    assert 7 not in [value for value, _ in ran]
 
 
 def test_settings_file_overrides_the_preset_and_nothing_else(tmp_path: Path) -> None:

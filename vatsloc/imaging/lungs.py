@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from registration.images.morphology import close, dilate, erode, largest
+from registration.images.morphology import close, dilate, distances_to, erode, largest
 from registration.volume import Array, Grid, Mask, Volume
 from vatsloc.errors import InputRefused
 from vatsloc.frames import Side
@@ -253,7 +253,7 @@ def _check_side(
     if not spots.any():
         raise InputRefused("The nodule lies outside the CT; give it in the CT's frame.")
     away = {
-        name: float(ndimage.distance_transform_edt(~lung, sampling=spacing)[spots].mean()) if lung.any() else np.inf
+        name: float(distances_to(lung, np.argwhere(spots), spacing).mean()) if lung.any() else np.inf
         for name, lung in halves.items()
     }
     other = _other(side)

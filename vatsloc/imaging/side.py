@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy import ndimage
 
-from registration.images.morphology import dilate, erode
+from registration.images.morphology import dilate, distances_to, erode
 from registration.volume import Array, Mask, Volume
 from vatsloc.errors import InputRefused
 from vatsloc.imaging.cbct import PreparedCbct, prepare_cbct
@@ -116,7 +116,7 @@ def nodule_side(ct: Volume, nodule: Mask | None, nodule_ras: Array | None) -> Si
         return None
     sides: tuple[Side, Side] = ("right", "left")
     off = {
-        side: float(ndimage.distance_transform_edt(~halves[side], sampling=work.grid.spacing)[spots].mean())
+        side: float(distances_to(halves[side], np.argwhere(spots), work.grid.spacing).mean())
         for side in sides
         if halves[side].any()
     }

@@ -11,7 +11,7 @@ from registration.images.resample import resample
 from registration.maps.field import DisplacementField
 from registration.volume import Array, Grid, Mask, Volume
 from vatsloc.case import Case
-from vatsloc.maps import MeshMap, sampled
+from vatsloc.maps import MeshMap, box_of, sampled
 from vatsloc.workflow.localization import Localization
 
 MARGIN_MM = 10.0
@@ -54,7 +54,11 @@ def _back(scan_from_ct: MeshMap, grid: Grid, spacing_mm: float) -> DisplacementF
 
 def warped_ct(ct: Volume, scan_from_ct: MeshMap, grid: Grid) -> Volume:
     """The CT on every voxel of a scan's grid, as the scan should show it."""
-    return resample(ct, grid, sampled(scan_from_ct.inverse(), grid, 0.0))
+    back = scan_from_ct.inverse()
+    warped = resample(ct, grid, back.around)
+    box, cut = box_of(back.mesh, grid)
+    warped.hu[cut] = resample(ct, box, sampled(back, box, 0.0)).hu
+    return warped
 
 
 def thinned(grid: Grid, spacing_mm: float) -> Grid:

@@ -17,7 +17,7 @@ from vatsloc.workflow.observe import spine_from_ct
 from vatsloc.workflow.parted import in_pieces
 from vatsloc.workflow.piece_contact import held_apart
 from vatsloc.workflow.pneumothorax import pneumothorax, refined
-from vatsloc.workflow.prepare import prepare
+from vatsloc.workflow.prepare import begin_scans, prepare
 from vatsloc.workflow.settings import Settings
 from vatsloc.workflow.stages import Stages
 from vatsloc.workflow.stand_in import stand_in
@@ -29,6 +29,15 @@ def localize(case: Case, settings: Settings, stages: Stages, state: State | None
 
     Raises InputRefused for images that do not show what they should, NotConverged when a solver has no answer.
     """
+    if state is None and case.cbct_inflated is not None:
+        begin_scans(case, case.cbct_inflated, stages)
+    try:
+        return _localized(case, settings, stages, state)
+    finally:
+        stages.forget()
+
+
+def _localized(case: Case, settings: Settings, stages: Stages, state: State | None) -> Localization:
     known = before_collapse(case, settings, stages, state)
     before, pose = known.complete or stand_in(case, known.prepared, settings, stages)
     prepared = prepare(case, stages, before)

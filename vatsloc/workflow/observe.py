@@ -16,12 +16,13 @@ from vatsloc.errors import InputRefused
 from vatsloc.imaging.hilum import Hilum, find_hilum
 from vatsloc.imaging.lattice import working_copy
 from vatsloc.imaging.pleura import Pneumothorax, find_pneumothorax
+from vatsloc.imaging.side import Seen
 from vatsloc.imaging.surface import Border, SurfacePoints, deflated_surface
 from vatsloc.imaging.thorax import SPACING_MM, ThoraxPrior
 from vatsloc.maps import MeshMap, covered, sampled
 from vatsloc.workflow.hilum import HilumMotion, HilumSource, hilum_motion
 from vatsloc.workflow.pose import ChangeOfPose, as_side
-from vatsloc.workflow.prepare import Prepared
+from vatsloc.workflow.prepare import SPINE_INFLATED_TO_DEFLATED, Prepared, pose_between
 from vatsloc.workflow.settings import Settings
 from vatsloc.workflow.stages import DEFLATED, Stages
 
@@ -59,15 +60,10 @@ def observe(
 ) -> Observed:
     """Register the spines (unless `rigid` is given), find the collapsed lung's surface and how its hilum moved."""
     if rigid is None:
-        with stages.stage("spine inflated to deflated"):
-            rigid = register_spine(
-                prepared.deflated.volume,
-                prepared.inflated.volume,
-                prepared.spine_deflated.mask,
-                prepared.spine_inflated.mask,
-                fixed_seen=prepared.deflated.field.usable,
-                moving_seen=prepared.inflated.field.usable,
-            )
+        with stages.stage(SPINE_INFLATED_TO_DEFLATED):
+            inflated = Seen(prepared.inflated, prepared.spine_inflated)
+            deflated = Seen(prepared.deflated, prepared.spine_deflated)
+            rigid = stages.done(lambda: pose_between(inflated, deflated))
     def_from_inf = rigid.moving_from_fixed.inverse()
     before = TetMesh(def_from_inf(pose.points_inf), pose.mesh_ct.tets)
     with stages.stage("deflated surface", DEFLATED):

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
+from functools import partial
 
+from registration.spine import RigidFit, register_spine
 from registration.volume import Mask, Volume
 from vatsloc.case import Case, CaseBefore
 from vatsloc.imaging.cbct import PreparedCbct, prepare_cbct
@@ -12,6 +15,8 @@ from vatsloc.imaging.lungs import Lungs, segment_lungs
 from vatsloc.imaging.side import PleuralGas, Seen, SeenScans, pleural_gas
 from vatsloc.imaging.spine import Spine, segment_spine
 from vatsloc.workflow.stages import CT, DEFLATED, INFLATED, Stages
+
+CBCT, SPINES, SPINE_INFLATED_TO_DEFLATED = "CBCT preparation", "spines", "spine inflated to deflated"
 
 
 @dataclass(frozen=True)
@@ -51,12 +56,41 @@ def prepare(case: Case, stages: Stages, known: PreparedBefore | None = None) -> 
             raise ValueError("the case has no inflated scan; give what stands in for it")
         known = prepare_before(case, case.cbct_inflated, stages)
     seen = _cbct(case.cbct_deflated, DEFLATED, stages, None if case.seen is None else case.seen.deflated)
-    with stages.stage("spines", DEFLATED):
+    with stages.stage(SPINES, DEFLATED):
         inflated = None if case.cbct_inflated is None else Seen(known.inflated, known.spine_inflated)
         gas = pleural_gas(SeenScans(inflated, seen))
         gas.require(case.side, case.side_told_by)
     own = {f.name: getattr(known, f.name) for f in fields(PreparedBefore)}
     return Prepared(**own, deflated=seen.cbct, spine_deflated=seen.spine, gas=gas)
+
+
+def begin_scans(case: Case, cbct_inflated: Volume, stages: Stages) -> None:
+    """Begin what the cone-beam CTs alone are needed for, up to the pose between them, beside the CT's stages."""
+    known = case.seen
+    inflated = _begin(cbct_inflated, INFLATED, stages, None if known is None else known.inflated)
+    deflated = _begin(case.cbct_deflated, DEFLATED, stages, None if known is None else known.deflated)
+    stages.begin(SPINE_INFLATED_TO_DEFLATED, "", lambda: pose_between(inflated(), deflated()))
+
+
+def _begin(image: Volume, name: str, stages: Stages, seen: Seen | None) -> Callable[[], Seen]:
+    """What waits for a cone-beam CT made fit for registration."""
+    if seen is not None:
+        return lambda: seen
+    cbct = stages.begin(CBCT, name, partial(prepare_cbct, image))
+    spine = stages.begin(SPINES, name, lambda: segment_spine(cbct().volume, cbct().field.usable))
+    return lambda: Seen(cbct(), spine())
+
+
+def pose_between(inflated: Seen, deflated: Seen) -> RigidFit:
+    """The spine of the inflated cone-beam CT, moving, registered to that of the deflated one."""
+    return register_spine(
+        deflated.cbct.volume,
+        inflated.cbct.volume,
+        deflated.spine.mask,
+        inflated.spine.mask,
+        fixed_seen=deflated.cbct.field.usable,
+        moving_seen=inflated.cbct.field.usable,
+    )
 
 
 def prepare_before(
@@ -71,7 +105,7 @@ def prepare_before(
 def prepare_ct(case: CaseBefore, stages: Stages) -> PreparedCt:
     """The part of `prepare` that needs the CT alone."""
     lungs = prepare_lungs(case, stages)
-    with stages.stage("spines", CT):
+    with stages.stage(SPINES, CT):
         spine = segment_spine(case.ct)
     return PreparedCt(lungs, lungs.of(case.side), spine)
 
@@ -92,9 +126,9 @@ def prepare_lungs(case: CaseBefore, stages: Stages) -> Lungs:
 def _cbct(image: Volume, name: str, stages: Stages, seen: Seen | None) -> Seen:
     """A cone-beam CT made fit for registration, once."""
     if seen is not None:
-        stages.skip("CBCT preparation", "done while the scans were read, for pleural gas had to tell the side")
+        stages.skip(CBCT, "done while the scans were read, for pleural gas had to tell the side")
         return seen
-    with stages.stage("CBCT preparation", name):
-        cbct = prepare_cbct(image)
-    with stages.stage("spines", name):
-        return Seen(cbct, segment_spine(cbct.volume, cbct.field.usable))
+    with stages.stage(CBCT, name):
+        cbct = stages.done(partial(prepare_cbct, image))
+    with stages.stage(SPINES, name):
+        return Seen(cbct, stages.done(lambda: segment_spine(cbct.volume, cbct.field.usable)))

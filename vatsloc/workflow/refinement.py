@@ -113,7 +113,8 @@ def refine_by_blocks(compared: Compared, shape: Shape, settings: RefinementSetti
     trial, answer = shape, None
     for voxel_mm, reach_mm in PASSES:
         matches = _blocks(around, starts, trial.map, voxel_mm, reach_mm)
-        matches = matches.only(_depth(shape.map.mesh, matches.moving) <= shape.within_mm)
+        if np.isfinite(shape.within_mm):
+            matches = matches.only(_depth(shape.map.mesh, matches.moving) <= shape.within_mm)
         if too_few(matches):
             break
         hidden = held_out(matches.fixed, APART_MM)

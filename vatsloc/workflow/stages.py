@@ -6,14 +6,17 @@ import resource
 import sys
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any, TypeVar
 
 from vatsloc.errors import as_ours
 from vatsloc.workflow.choices import Choice
 
 Say = Callable[[str], None]
+Done = TypeVar("Done")
 CT, INFLATED, DEFLATED = "CT", "inflated CBCT", "deflated CBCT"
 """What the images are called in sentences."""
 
@@ -36,6 +39,8 @@ class Log:
 class Stages:
     """Log of a run. seconds, cpu_seconds (all threads) and peak_mb: by stage name, in the order they first ran, a stage
     that comes again added up; skipped: stage -> why; choices: what the scene had a say in.
+
+    What a later stage needs can be begun on a second thread; the stage then takes as long as it has to wait.
     """
 
     say: Say = quiet
@@ -48,6 +53,9 @@ class Stages:
     _start: float = field(default_factory=time.perf_counter)
     _where: str = "The command"
     _image: str = ""
+    _name: str = ""
+    _beside: ThreadPoolExecutor | None = None
+    _begun: dict[tuple[str, str], Future[Any]] = field(default_factory=dict)
 
     @contextmanager
     def stage(self, name: str, image: str = "") -> Iterator[None]:
@@ -57,7 +65,7 @@ class Stages:
         the block works on one or says so by `on`.
         """
         self.say(f"{name} ...")
-        self._where, self._image = f"The stage '{name}'", image
+        self._where, self._image, self._name = f"The stage '{name}'", image, name
         reset = _reset_peak()
         start, start_cpu = time.perf_counter(), time.process_time()
         with self.named():
@@ -68,6 +76,29 @@ class Stages:
         self.peak_mb[name] = max(round(_peak_mb(reset), 1), self.peak_mb.get(name, 0.0))
         self._where, self._image = f"What follows the stage '{name}'", ""
         self.say(f"{name}: {took:.1f} s")
+
+    def begin(self, name: str, image: str, work: Callable[[], Done]) -> Callable[[], Done]:
+        """Begin the work of the stage `name` on a second thread, after what was begun before; what is returned waits
+        for it. `forget` has to follow.
+
+        Nothing with numba's own parallel loops may be begun: they serve one thread at a time.
+        """
+        if self._beside is None:
+            self._beside = ThreadPoolExecutor(1, thread_name_prefix="beside")
+        future = self._begun[name, image] = self._beside.submit(work)
+        return future.result
+
+    def done(self, work: Callable[[], Done]) -> Done:
+        """Result of the work of the stage at work: of what was begun for it, else of doing it now."""
+        begun = self._begun.pop((self._name, self._image), None)
+        return work() if begun is None else begun.result()
+
+    def forget(self) -> None:
+        """Drop what was begun and not asked for; what is at work ends by itself."""
+        if self._beside is not None:
+            self._beside.shutdown(wait=False, cancel_futures=True)
+            self._beside = None
+        self._begun.clear()
 
     def on(self, image: str) -> None:
         """Say which image the stage at work looks at from here on."""
