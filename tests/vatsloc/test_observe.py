@@ -15,6 +15,7 @@ from vatsloc.errors import InputRefused
 from vatsloc.imaging.hilum import Hilum
 from vatsloc.imaging.surface import Border
 from vatsloc.workflow import observe as module
+from vatsloc.workflow import prepare
 from vatsloc.workflow.hilum import HilumMotion, HilumSource
 from vatsloc.workflow.observe import Observed, held_nodes, observe
 from vatsloc.workflow.pose import ChangeOfPose
@@ -52,7 +53,7 @@ class Watched:
             "hilum_motion": HilumMotion(np.zeros((1, 3)), HilumSource.AIRWAYS),
         }
         for name, answer in answers.items():
-            monkeypatch.setattr(module, name, self._asked(name, answer))
+            monkeypatch.setattr(prepare if name == "register_spine" else module, name, self._asked(name, answer))
 
     def _asked(self, name: str, answer: Any) -> Any:
         def ask(*values: Any, **named: Any) -> Any:
