@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
+from functools import cached_property
 
 import numpy as np
 from scipy.sparse import bsr_matrix, csr_matrix, diags
@@ -17,7 +18,8 @@ from poro.contact.chest_wall import ChestWall
 from poro.errors import SolverError
 from poro.fem.constitutive import ConstitutiveModel
 from poro.fem.forms import deformation_gradient, eigenstress_load, tangent_stiffness
-from poro.linalg.solver import linear_solver
+from poro.linalg.dissection import Tree
+from poro.linalg.solver import elimination_tree, linear_solver
 from poro.mesh.tetmesh import TetMesh
 
 _MAX_NEWTON = 25  # steps for one share of the load
@@ -32,6 +34,7 @@ class FiniteStatus(Enum):
 
     SOLVED = "forces balance at finite strain"
     STOPPED = "the load could not be raised further: Newton did not converge on the smallest load step"
+    OUT_OF_STEPS = "Newton took as many steps as it was given before all of the load was carried"
 
 
 @dataclass(frozen=True)
@@ -57,6 +60,12 @@ class FiniteProblem:
     contact: WallContact | None = None
     pressure_drop: Array | None = None
 
+    @cached_property
+    def tree(self) -> Tree:
+        """Order in which a tangent is eliminated: the same for all of them, since its entries are."""
+        nothing = np.zeros((len(self.mesh.tets), 3, 3, 3, 3))
+        return elimination_tree(tangent_stiffness(self.mesh, nothing), self.mesh.points)
+
 
 @dataclass(frozen=True)
 class FiniteState:
@@ -73,10 +82,11 @@ class FiniteState:
     status: FiniteStatus
 
 
-def deform(problem: FiniteProblem, tolerance: float = 1e-8) -> FiniteState:
+def deform(problem: FiniteProblem, tolerance: float = 1e-8, most_steps: float = np.inf) -> FiniteState:
     """Raise the load in steps, halved when Newton fails and doubled when it does not, until all of it is carried.
 
-    tolerance: relative residual of a balanced lung.
+    tolerance: relative residual of a balanced lung; most_steps: Newton steps in all, after which no further share of
+    the load is tried.
     """
     contacts = 0 if problem.contact is None else len(problem.contact.nodes)
     u, force, active = np.zeros_like(problem.load), np.zeros(contacts), np.zeros(contacts, bool)
@@ -92,7 +102,10 @@ def deform(problem: FiniteProblem, tolerance: float = 1e-8) -> FiniteState:
             step /= 2
             if step < _SMALLEST_STEP:
                 break
-    status = FiniteStatus.SOLVED if share >= 1 else FiniteStatus.STOPPED
+        if len(residuals) >= most_steps:
+            break
+    ended = FiniteStatus.STOPPED if step < _SMALLEST_STEP else FiniteStatus.OUT_OF_STEPS
+    status = FiniteStatus.SOLVED if share >= 1 else ended
     return FiniteState(u, force, active, share, tuple(residuals), taken, status)
 
 
@@ -240,7 +253,9 @@ def _constrained_step(
     right = (rotation @ unbalanced.ravel() - rotated @ imposed.ravel()) * ~known.ravel()
     scale = float(rotated.diagonal().mean())
     reduced = (free @ rotated @ free + diags(scale * known.ravel())).tocsr()
-    change = linear_solver(reduced, problem.mesh.points).solve(right + scale * imposed.ravel() * known.ravel())
+    change = linear_solver(reduced, problem.mesh.points, problem.tree).solve(
+        right + scale * imposed.ravel() * known.ravel()
+    )
     reaction = (rotated @ change - rotation @ unbalanced.ravel()).reshape(-1, 3)
     force = np.zeros(len(nodes))
     force[active] = reaction[pressed, 0] / steep

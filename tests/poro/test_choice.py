@@ -7,7 +7,17 @@ import pytest
 from numpy.testing import assert_allclose
 from shapes import ellipsoid
 
-from poro.collapse import LinearRange, PoroSystem, StrainMeasure, Theta, assemble, hilum_modes, keep_in_range, solve
+from poro.collapse import (
+    LinearRange,
+    PoroSystem,
+    StrainMeasure,
+    Theta,
+    assemble,
+    choice,
+    hilum_modes,
+    keep_in_range,
+    solve,
+)
 from poro.collapse.choice import StrainChoice, finite_problem
 from poro.collapse.finite_strain import FiniteProblem, FiniteStatus, deform
 from poro.fem import Tissue, neo_hookean, solid
@@ -78,6 +88,20 @@ def test_collapsed_lungs_go_finite_and_hold_signorini(system: PoroSystem) -> Non
     assert chosen.finite is not None
     assert chosen.finite.residuals[-1] < 1e-8
     assert state.det_f @ system.mesh.volumes > solve(system, theta).det_f @ system.mesh.volumes
+
+
+def test_a_lung_that_takes_too_many_steps_stays_linear_and_says_so(
+    system: PoroSystem, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(choice, "MOST_STEPS", 2)
+    linear = solve(system, Theta(1e-6, 0.5, 4.0))
+    chosen = keep_in_range(system, linear, MATERIAL, LinearRange(min_det=0.5))
+    assert chosen.state is linear
+    assert chosen.strain is StrainMeasure.LINEAR
+    assert chosen.finite is not None
+    assert chosen.finite.status is FiniteStatus.OUT_OF_STEPS
+    assert 0 <= chosen.finite.share < 1
+    assert f"neo-Hookean carried only {100 * chosen.finite.share:.0f} % of the load in" in chosen.why
 
 
 def test_finite_strain_is_left_out_where_it_moves_nothing_and_kept_where_it_does(system: PoroSystem) -> None:
