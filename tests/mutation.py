@@ -47,7 +47,7 @@ Scope = Mapping[str, tuple[str, ...] | None]
 SCOPE: Scope = {
     "registration/**/*.py": (),
     "poro/**/*.py": (),
-    "poro/contact/*.py": named("poro", "contact hertz"),
+    "poro/contact/*.py": named("poro", "contact hertz contact_pieces separation"),
     "poro/mesh/*.py": named("poro", "mesh mesh_masks rasterize pieces contact fit")
     + named("vatsloc", "shuffled_nodes"),
     "vatsloc/case.py": named("vatsloc", "case case_refused marks new_case greyvalues dicom_regions"),

@@ -205,7 +205,7 @@ def test_hilum_is_tracked_by_value_and_sign(shift: tuple[float, float, float]) -
     tracked = track_hilum(cbct, Mask(scene.airways.inside, affine), root - np.array(shift), radius_mm=60.0)
     assert_allclose(tracked.shift_mm, shift, atol=1.6)
     assert tracked.contrast_hu > 300.0
-    assert tracked.contrast_hu > tracked.runner_up_hu
+    assert tracked.contrast_hu > tracked.runner_up_hu > 0.0  # the tree half over itself
 
 
 @pytest.mark.shared
