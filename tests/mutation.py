@@ -61,7 +61,7 @@ SCOPE: Scope = {
         "formats_transforms malformed_images malformed_marks case marks slicer_scene",
     ),
     "vatsloc/formats/dicom/*.py": named(
-        "vatsloc", "formats_dicom dicom_files dicom_series dicom_pixels dicom_regions dicom_malformed marks"
+        "vatsloc", "formats_dicom dicom_files dicom_series dicom_pixels dicom_regions dicom_malformed dicom_out marks"
     ),
     "vatsloc/imaging/**/*.py": named(
         "vatsloc",
