@@ -76,6 +76,10 @@ def test_stress_and_moduli_of_tissue_under_pressure_are_the_derivatives_of_its_e
     assert np.isfinite(energy).all()
 
 
+def test_a_printed_scene_leaves_its_elimination_tree_out() -> None:
+    assert "tree" not in repr(free_scene(pear()))
+
+
 def test_a_lung_fills_its_cavity_and_stays_within() -> None:
     expired, inspired = pear(), pear(stretch=np.array([1.05, 1.1, 1.15]))
     scene = inflating(Lung("right", inspired, expired), WALL_ALONE)
