@@ -47,7 +47,7 @@ Scope = Mapping[str, tuple[str, ...] | None]
 SCOPE: Scope = {
     "registration/**/*.py": (),
     "poro/**/*.py": (),
-    "poro/contact/*.py": named("poro", "contact hertz"),
+    "poro/contact/*.py": named("poro", "contact hertz contact_pieces separation"),
     "poro/mesh/*.py": named("poro", "mesh mesh_masks rasterize pieces contact fit")
     + named("vatsloc", "shuffled_nodes"),
     "vatsloc/case.py": named("vatsloc", "case case_refused marks new_case greyvalues dicom_regions"),
@@ -61,7 +61,7 @@ SCOPE: Scope = {
         "formats_transforms malformed_images malformed_marks case marks slicer_scene",
     ),
     "vatsloc/formats/dicom/*.py": named(
-        "vatsloc", "formats_dicom dicom_files dicom_series dicom_pixels dicom_regions dicom_malformed marks"
+        "vatsloc", "formats_dicom dicom_files dicom_series dicom_pixels dicom_regions dicom_malformed dicom_out marks"
     ),
     "vatsloc/imaging/**/*.py": named(
         "vatsloc",

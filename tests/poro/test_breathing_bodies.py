@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from breathing_shapes import HALF, pear
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -13,7 +13,7 @@ from poro.arrays import Array
 from poro.breathing.body import Body, body, border_motion, network, spring_stiffness
 from poro.breathing.elastic import WALL_ALONE, Lung
 from poro.breathing.mesh_quality import _slopes, quality, smooth, violations
-from poro.breathing.regional import Thorax, _turned, fit_pressures, press, thorax
+from poro.breathing.regional import SECTORS, STOREYS, Thorax, _patches, _turned, fit_pressures, press, thorax
 from poro.mesh import TetMesh, stuff
 
 REGULAR = np.array([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
@@ -56,6 +56,17 @@ def test_descent_lifts_the_worst_element_and_leaves_the_surface() -> None:
     assert better.volumes.sum() == pytest.approx(mesh.volumes.sum())
 
 
+def test_a_node_next_to_its_best_place_is_not_moved_past_it() -> None:
+    """Eight elements about the middle of an octahedron: every step that is tried goes too far."""
+    corners = np.concatenate([np.eye(3), -np.eye(3)])
+    faces = [(i, j, k) for i in (0, 3) for j in (1, 4) for k in (2, 5)]
+    for off in ([0.004, 0, 0], [0.003, -0.003, 0.002]):
+        points = np.concatenate([corners, [off]])
+        tets = np.array([(6, *face) for face in faces])
+        mesh = TetMesh(points, np.where((quality(points, tets) > 0)[:, None], tets, tets[:, [0, 2, 1, 3]]))
+        assert violations(smooth(mesh)).worst >= violations(mesh).worst - 1e-12
+
+
 def ball_mask(margin: int = 6) -> tuple[Array, Array]:
     step = 5.0
     n = np.ceil(HALF / step).astype(int) + margin
@@ -82,6 +93,19 @@ def test_chest_and_abdomen_reach_30_mm_about_the_lung_s_voxels(chest: tuple[Thor
     far = cKDTree(voxels).query(scene.mesh.points[len(lung.expired.points) :])[0]
     assert 29.0 < far.max() < 32.0  # 33.4 with the voxels that are 30 mm off
     assert far.min() > 0.5
+
+
+def test_patches_of_the_chest_are_sectors_of_one_angle_in_storeys_of_one_height() -> None:
+    lung = pear(12.0)
+    walls = lung.boundary
+    x, y, z = walls.points[walls.triangles].mean(axis=1).T
+    centre = np.average(lung.points, axis=0, weights=lung.node_volumes)
+    turn = (np.degrees(np.arctan2(y - centre[1], x - centre[0])) + 180) % 360
+    patch = _patches(walls, np.zeros(len(walls.points), bool), lung)
+    assert_array_equal(np.unique(patch), np.arange(SECTORS * STOREYS))
+    assert_array_equal(patch % SECTORS, turn // (360 / SECTORS))
+    lowest, highest = (np.array([f(z[patch // SECTORS == k]) for k in range(STOREYS)]) for f in (np.min, np.max))
+    assert (lowest[1:] >= highest[:-1]).all()
 
 
 def test_pressures_pull_lung_and_wall_outward_and_their_derivative_is_what_they_do(chest: tuple[Thorax, Lung]) -> None:

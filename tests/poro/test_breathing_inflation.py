@@ -13,8 +13,8 @@ from poro.breathing import one_scan as module
 from poro.breathing.cavity import TISSUE as TISSUE_OF_LUNG
 from poro.breathing.cavity import inflating
 from poro.breathing.elastic import WALL_ALONE, Lung
-from poro.breathing.equilibrium import Balance, ConstraintTerms, Scene, balance, volume
-from poro.breathing.inflation import Filled, fill, fill_to
+from poro.breathing.equilibrium import Balance, ConstraintTerms, Scene, _tissue, balance, volume
+from poro.breathing.inflation import Filled, _swelling, fill, fill_to
 from poro.breathing.one_scan import _wall, one_scan, regions
 from poro.breathing.pressure_volume import PER_PA, inspired_volume, pressure_volume, recoil_pa
 from poro.fem import Tissue, neo_hookean
@@ -56,6 +56,28 @@ def test_balance_under_a_given_pressure_is_the_same_swelling() -> None:
     assert found.balance is Balance.BALANCED
     assert volume(mesh, found.u) / mesh.volumes.sum() == pytest.approx(s**3, rel=1e-4)
     assert found.residuals[-1] < 1e-7
+
+
+def test_the_force_of_a_unit_pressure_is_the_volume_s_derivative() -> None:
+    """Where tissue is sheared and turned, so that no gradient is symmetric."""
+    mesh, rng, h = pear(), np.random.default_rng(2), 1e-4
+    u = mesh.points @ np.array([[0.1, 0.3, -0.2], [-0.1, 0.05, 0.25], [0.15, -0.3, -0.1]])
+    way = rng.normal(size=mesh.points.shape)
+    slope = (volume(mesh, u + h * way) - volume(mesh, u - h * way)) / (2 * h)
+    assert (_swelling(free_scene(mesh), u) * way).sum() == pytest.approx(slope, rel=1e-6)
+
+
+def test_stress_and_moduli_of_tissue_under_pressure_are_the_derivatives_of_its_energy() -> None:
+    scene, rng, h = free_scene(pear(), 0.7), np.random.default_rng(3), 1e-5
+    f, way = np.eye(3) + 0.2 * rng.normal(size=(4, 3, 3)), rng.normal(size=(4, 3, 3))
+    (energy, stress, moduli), ahead, behind = (_tissue(scene, f + t * way) for t in (0, h, -h))
+    assert_allclose((ahead[0] - behind[0]) / (2 * h), np.einsum("mij,mij->m", stress, way), rtol=1e-6)
+    assert_allclose((ahead[1] - behind[1]) / (2 * h), np.einsum("mijkl,mkl->mij", moduli, way), rtol=1e-5, atol=1e-6)
+    assert np.isfinite(energy).all()
+
+
+def test_a_printed_scene_leaves_its_elimination_tree_out() -> None:
+    assert "tree" not in repr(free_scene(pear()))
 
 
 def test_a_lung_fills_its_cavity_and_stays_within() -> None:

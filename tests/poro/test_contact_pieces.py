@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from blocks import Pair, Spheres, stacked
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.sparse import identity
 from shapes import box, compliance_of, order
 from test_contact import _floor
@@ -94,6 +94,19 @@ def test_where_pieces_share_nodes_no_gap_is_asked_for() -> None:
     )
     assert one not in grown.nodes
     assert len(grown.nodes) == len(np.unique(pair.below)) - 1
+
+
+def test_among_some_nodes_the_triangles_stay_that_have_all_their_corners_there() -> None:
+    pair = stacked(CELLS, WIDTH, HEIGHTS, np.eye(3))
+    whole = pair.facing()
+    nodes = np.flatnonzero(whole.rest[:, 0] < 0.6 * WIDTH)
+    part = whole.among(nodes)
+    assert_allclose(part.rest, whole.rest[nodes])
+    for kept, all_of_them in ((part.first, whole.first), (part.second, whole.second)):
+        inside = np.isin(all_of_them, nodes).all(axis=1)
+        assert 0 < inside.sum() < len(all_of_them)
+        assert_array_equal(nodes[kept], all_of_them[inside])
+    assert_array_equal(nodes[part.nodes], np.intersect1d(whole.nodes, nodes[part.first]))
 
 
 @pytest.mark.parametrize("swapped", [False, True])

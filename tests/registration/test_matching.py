@@ -20,7 +20,7 @@ def test_a_shifted_image_gives_matches_that_differ_by_the_shift(shift_ras: tuple
     fixed = image_of(PATTERN, GRID)
     moving = image_of(lambda points: PATTERN(points - shift), GRID)
     matches = match_keypoints(fixed, moving, EVERYWHERE)
-    assert len(matches) > 40
+    assert len(matches) > 180  # of some 210; half of them where blocks are looked for about a wrong voxel
     error = np.linalg.norm(matches.moving - matches.fixed - shift, axis=1)
     assert np.median(error) < 0.5  # a quarter of a voxel
     assert error.max() < 2.0

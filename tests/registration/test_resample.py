@@ -156,3 +156,12 @@ def test_a_padded_mask_is_the_same_region_with_room_around_it() -> None:
     padded = mask.padded()
     assert padded.inside.shape == (4, 5, 6)
     assert_allclose(padded.grid.to_ras(np.argwhere(padded.inside)), mask.grid.to_ras(np.argwhere(mask.inside)))
+
+
+@pytest.mark.parametrize("codes", ["RAS", "LPS", "SAR"])
+def test_a_coarser_grid_covers_the_same_box_from_corner_to_corner(codes: str) -> None:
+    fine = tilted(oriented(codes, (20, 20, 20), 1.5, CENTRE), TILT)
+    coarse = fine.with_spacing(fine.spacing * [2, 4, 5])
+    assert coarse.shape == (10, 5, 4)
+    for corner in (np.zeros(3), np.ones(3), np.array([1, 0, 0.5])):
+        assert_allclose(coarse.to_ras(corner * coarse.shape - 0.5), fine.to_ras(corner * fine.shape - 0.5), atol=1e-9)

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from scipy.spatial.transform import Rotation
 
 from registration import spine
 from registration.maps.rigid import RigidTransform
@@ -97,6 +98,20 @@ def test_a_hint_overrides_the_search() -> None:
     assert_allclose(fit.moving_from_fixed(CENTRE[None]), slipped(CENTRE[None]), atol=4.0)
     assert fit.runner_up_ncc > fit.ncc
     assert fit.status is RigidStatus.AMBIGUOUS
+
+
+def test_the_starts_of_a_search_lie_apart_by_place_or_by_turn() -> None:
+    move = RigidTransform.about(CENTRE, np.radians([0.0, 5.0, 8.0]), np.array([4.0, 2.0, 10.0]))
+    grid = fixed_grid(move)
+    level = spine._levels(scene(grid, move), scene(MOVING), column(grid, move), None, None, 30.0)[0]
+    search = SpineSearch(shift_mm=20.0, surroundings_mm=30.0)
+    starts = spine._coarse(level, CENTRE, move.inverse(), search, None)
+    assert len(starts) == 24
+    for n, one in enumerate(starts):
+        for other in starts[:n]:
+            far = np.linalg.norm(one(CENTRE[None]) - other(CENTRE[None]))
+            turn = Rotation.from_matrix(one.matrix[:3, :3] @ other.matrix[:3, :3].T).magnitude()
+            assert far > 12.0 or np.degrees(turn) > 15.0
 
 
 def test_nothing_in_common_is_called_poor() -> None:

@@ -12,7 +12,7 @@ from pydantic import ValidationError
 
 from registration.volume import Mask, axis_codes
 from tests.vatsloc.case_scene import CENTRE, IMAGES, ball, chest, grid_at, point, whole_case, write_toml
-from vatsloc.case import read_case, read_landmarks
+from vatsloc.case import read_case, read_case_before, read_landmarks
 from vatsloc.errors import CaseError
 from vatsloc.formats.casefile import read_case_file
 from vatsloc.formats.meshes import write_stl
@@ -189,3 +189,12 @@ def test_named_landmarks_that_are_missing_are_a_case_error(folder):
     write_toml(folder, landmarks={"cbct_deflated": "gone.mrk.json"})
     with pytest.raises(CaseError, match=r"gone\.mrk\.json does not exist"):
         read_landmarks(folder)
+
+
+def test_before_the_collapse_an_inflated_scan_counts_once_its_file_is_there(folder: Path) -> None:
+    (folder / IMAGES["cbct_deflated"]).unlink()
+    before = read_case_before(folder)
+    assert before.cbct_inflated is not None
+    assert before.cbct_inflated.hu.shape == (14, 14, 12)
+    (folder / IMAGES["cbct_inflated"]).unlink()
+    assert read_case_before(folder).cbct_inflated is None

@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 
 from registration.volume import Mask, Volume
 from tests.vatsloc.case_scene import CENTRE, IMAGES, ball, check_refused, chest, grid_at, point, whole_case, write_toml
-from vatsloc.case import read_case
+from vatsloc.case import _read_image, read_case
 from vatsloc.errors import CaseError, InputRefused
 from vatsloc.formats.meshes import write_stl
 from vatsloc.formats.nifti import write_mask, write_volume
@@ -151,3 +151,18 @@ def test_deflated_surface_in_another_frame_is_refused(folder):
     check_refused(
         folder, InputRefused, "0 % of its points inside the deflated CBCT, 90 % needed; save it in LPS millimetres"
     )
+
+
+@pytest.mark.parametrize(("spacing", "length", "is_chest"), [(10.0, 14, True), (1.0, 14, False), (10.0, 310, False)])
+def test_an_image_whose_longest_side_is_no_chest_s_is_refused(
+    tmp_path: Path, spacing: float, length: int, is_chest: bool
+) -> None:
+    """Three voxels high: a scan may be flat."""
+    grid, path = grid_at(spacing=spacing, n=(length, 12, 3)), tmp_path / "flat.nii.gz"
+    hu = np.where(np.arange(length)[:, None, None] < 5, -900, 40) * np.ones(grid.shape)
+    write_volume(path, Volume(hu.astype(np.float32), grid.ras_from_ijk))
+    if is_chest:
+        assert _read_image(path, None)[0].hu.shape == grid.shape
+    else:
+        with pytest.raises(InputRefused, match=r"measures .* mm, which no image of a chest does"):
+            _read_image(path, None)

@@ -86,6 +86,17 @@ def test_one_slice_is_as_thick_as_slices_are_apart_or_else_as_stated(tmp_path, s
     assert read_mask(written(ds, tmp_path / "seg.dcm")).grid.spacing[2] == pytest.approx(thick)
 
 
+@pytest.mark.parametrize(("stated", "between"), [(3.0, 3.0), (2.0, 2.0), (4.0, 6.0), (6.0, 6.0)])
+def test_slices_lie_apart_as_stated_where_frames_lie_on_such_slices_and_else_as_the_frames(tmp_path, stated, between):
+    """Two frames 6 mm apart, with one empty slice between them where 3 mm are stated and two where 2 mm are."""
+    on = grid()
+    ds = segmentation(on, {"nodule": blob(on, (2, 5), (3, 6), (2, 3)) | blob(on, (2, 5), (3, 6), (4, 5))})
+    ds.SharedFunctionalGroupsSequence[0].PixelMeasuresSequence[0].SpacingBetweenSlices = stated
+    mask = read_mask(written(ds, tmp_path / "seg.dcm"))
+    assert mask.grid.spacing[2] == pytest.approx(between)
+    assert mask.inside.sum() == 18
+
+
 def test_one_slice_without_a_thickness_is_refused(tmp_path):
     on = grid()
     ds = segmentation(on, {"nodule": blob(on, (2, 5), (3, 6), (4, 5))})

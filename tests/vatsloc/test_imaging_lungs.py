@@ -6,15 +6,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 
-from registration.volume import Mask, Volume
+from registration.volume import Grid, Mask, Volume
 from tests.vatsloc import imaging_thorax as known
 from vatsloc.case import read_case
 from vatsloc.errors import InputRefused
 from vatsloc.frames import Side
 from vatsloc.imaging.hilum import find_hilum
-from vatsloc.imaging.lungs import _midline, _sides, segment_lungs
+from vatsloc.imaging.lungs import _air_in_body, _midline, _sides, part_joined, segment_lungs
 
 
 def ball(centre: tuple[float, float, float], radius: float) -> Mask:
@@ -88,6 +88,17 @@ def test_nodule_at_the_pleura_belongs_to_the_lung() -> None:
     assert known.dice(lungs.right, scene.lungs["right"]) > 0.95
 
 
+def test_nodule_on_another_grid_belongs_to_the_lung_as_well() -> None:
+    scene = known.thorax()
+    place = np.array([known.CENTRES["right"][0] + known.HALF_AXES[0] + 2.0, 10.0, -10.0])
+    nodule = ball(tuple(place), 7.0)
+    hu = np.where(nodule.inside, np.float32(30), scene.volume.hu)
+    other = known.grid((20, 20, 20), 1.5, tuple(place))
+    drawn = Mask(np.linalg.norm(other.points() - place, axis=-1) < 7.0, other.ras_from_ijk)
+    lungs = segment_lungs(Volume(hu, scene.volume.ras_from_ijk), "right", drawn)
+    assert lungs.right.inside[nodule.inside].mean() > 0.8
+
+
 def test_dense_patch_in_the_lung_is_kept() -> None:
     scene = known.thorax()
     patch = ball((75.0, 0.0, -40.0), 14.0)
@@ -128,6 +139,32 @@ def test_ct_cropped_through_the_other_lung_keeps_both() -> None:
     lungs = segment_lungs(Volume(scene.volume.hu[start:].copy(), affine), "right")
     truth = Mask(scene.lungs["right"].inside[start:], affine)
     assert known.dice(lungs.right, truth) > 0.96
+
+
+def test_air_at_the_side_of_a_cropped_ct_is_the_lung_s_unless_it_is_as_dark_as_room_air() -> None:
+    """Two pockets at either side face, lung at one and room air at the other; and the room in front and behind."""
+    hu = np.zeros((20, 24, 10), np.float32)
+    hu[:, :3], hu[:, -3:] = -1000.0, -1000.0
+    lung, room, inner = np.s_[:6, 6:12], np.s_[-6:, 6:12], np.s_[8:12, 14:18]
+    hu[lung], hu[room], hu[inner] = -850.0, -1000.0, -1000.0
+    found = _air_in_body(Volume(hu, np.diag([2.0, 2.0, 2.0, 1.0])))
+    expected = np.zeros(hu.shape, dtype=bool)
+    expected[lung], expected[inner] = True, True
+    assert_array_equal(found, expected)
+
+
+def test_parted_lungs_grow_back_into_all_corners_where_slices_are_thick() -> None:
+    g = Grid((50, 24, 12), np.diag([1.0, 1.0, 4.0, 1.0]))
+    joined = np.zeros(g.shape, dtype=bool)
+    joined[2:22, 2:22, 1:11], joined[26:46, 2:22, 1:11] = True, True
+    joined[22:26, 11:13, 5] = True
+    found = part_joined(joined, g)
+    assert found is not None
+    small, large = sorted(found, key=lambda part: np.argwhere(part)[:, 0].mean())
+    assert_array_equal((small | large)[:22], joined[:22])
+    assert_array_equal((small | large)[26:], joined[26:])
+    assert not small[26:].any()
+    assert not large[:22].any()
 
 
 @pytest.mark.parametrize("neck_mm", [-4.0, 0.0, 4.0])

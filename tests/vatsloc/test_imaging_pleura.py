@@ -17,7 +17,7 @@ from vatsloc.errors import InputRefused
 from vatsloc.imaging.cbct import PreparedCbct, prepare_cbct
 from vatsloc.imaging.hilum import track_hilum
 from vatsloc.imaging.lungs import segment_lungs
-from vatsloc.imaging.pleura import Pneumothorax, _large_pieces, _lung_beside, air_limit, find_pneumothorax
+from vatsloc.imaging.pleura import Pneumothorax, _large_pieces, _local_limit, _lung_beside, air_limit, find_pneumothorax
 from vatsloc.imaging.surface import Border, deflated_surface, diaphragm_points, inflated_surface
 from vatsloc.imaging.thorax import ThoraxPrior, carry_prior, inflated_lung, require_share, visible_share
 
@@ -205,7 +205,18 @@ def test_hilum_is_tracked_by_value_and_sign(shift: tuple[float, float, float]) -
     tracked = track_hilum(cbct, Mask(scene.airways.inside, affine), root - np.array(shift), radius_mm=60.0)
     assert_allclose(tracked.shift_mm, shift, atol=1.6)
     assert tracked.contrast_hu > 300.0
-    assert tracked.contrast_hu > tracked.runner_up_hu
+    assert tracked.contrast_hu > tracked.runner_up_hu > 0.0  # the tree half over itself
+
+
+@pytest.mark.parametrize("shading", [-40.0, 0.0, 40.0])
+def test_the_level_between_air_and_lung_follows_the_shading_and_nothing_beside_the_chest(shading: float) -> None:
+    g = known.grid((28, 20, 20), 2.5)
+    x = g.points()[..., 0]
+    space = (np.abs(g.points()) < [30, 20, 20]).all(axis=-1)
+    hu = np.where(space, np.where(x < 0, -1000.0, -700.0) + shading, -950.0)
+    hu[16:19, 9:11, 9:11] = 40.0  # a vessel
+    found = _local_limit(Volume(hu.astype(np.float32), g.ras_from_ijk), space, space & (x < 0), -850.0, 300.0)
+    assert_allclose(found[(np.abs(x) < 8) & space], -850.0 + shading, atol=8)
 
 
 @pytest.mark.shared

@@ -199,6 +199,10 @@ def test_a_match_counts_where_two_of_its_neighbours_move_alike() -> None:
     motion[[4, 17]] += [[0, 9.0, 0], [0, 7.0, 0]]
     kept = module._consistent(Correspondences.of(at, at - motion, np.ones(20)))
     assert_array_equal(np.setdiff1d(at[:, 0], kept.fixed[:, 0]), [4])
+    three_and_two = np.zeros((20, 3))
+    three_and_two[9:12], three_and_two[16:18] = [0, 30.0, 0], [0, 0, 40.0]
+    kept = module._consistent(Correspondences.of(at, at - three_and_two, np.ones(20)))
+    assert_array_equal(np.setdiff1d(at[:, 0], kept.fixed[:, 0]), [16, 17])
 
 
 def test_other_places_lie_to_all_sides_of_the_model_and_are_smaller_and_larger() -> None:

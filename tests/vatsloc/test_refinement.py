@@ -120,6 +120,22 @@ def test_anchors_stay_and_deep_blocks_are_left_out() -> None:
     assert Lung.error(found.points)[Lung.depth < 8.0].mean() < 0.6 * Lung.error(Lung.start)[Lung.depth < 8.0].mean()
 
 
+def test_of_the_scan_s_points_those_are_followed_that_lie_near_the_pleura_before_the_collapse() -> None:
+    """Points of tissue are taken back to the CT, where the lung is a ball, by maps in closed form."""
+    within = 8.0
+    mapped = MeshMap(Lung.mesh, Lung.truth, AROUND)
+    points, chosen = (
+        module._starts(compared(), Shape(Lung.rest, mapped, np.zeros(0, int), reach), 8.0) for reach in (np.inf, within)
+    )
+    before = AROUND.inverse()(scene.expanded(points))
+    depth = scene.RADIUS_MM - np.linalg.norm(before - scene.CENTRE_CT, axis=1)
+    limit = within + module.PASSES[0][1]
+    taken = (points[:, None] == chosen[None]).all(axis=2).any(axis=1)
+    clear = np.abs(depth - limit) > 1.0
+    assert (depth[clear] > limit).sum() > 20
+    assert_array_equal(taken[clear], depth[clear] < limit)
+
+
 def test_a_lung_that_is_right_is_left_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
     """Blocks that scatter about the truth predict those held out no better than the truth does."""
     rng = np.random.default_rng(0)

@@ -161,9 +161,10 @@ def test_settings_file_overrides_the_preset_and_nothing_else(tmp_path: Path) -> 
     assert mine.mesh.edge_mm == 9
     assert mine.mesh.model_edge_mm == fast.mesh.model_edge_mm
     assert mine.registration == fast.registration
-    file.write_text("[mesh]\nedge_mm = 900\n")
-    with pytest.raises(CaseError, match=r"mesh\.edge_mm"):
-        load_settings("fast", file)
+    for table, key, value in (("mesh", "edge_mm", 900), ("leave_out", "residual_mm", -1.5)):
+        file.write_text(f"[{table}]\n{key} = {value}\n")
+        with pytest.raises(CaseError, match=rf"{table}\.{key}"):
+            load_settings("fast", file)
 
 
 @pytest.mark.parametrize("preset", ["fast", "balanced", "accurate", "auto"])
