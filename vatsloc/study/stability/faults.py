@@ -18,7 +18,9 @@ from vatsloc.study.stability.fit import Scene, direction, errors_mm, read_scene,
 from vatsloc.study.tables import Row, markdown
 from vatsloc.workflow.localization import Localization, checked, locate_nodule
 from vatsloc.workflow.localize import localize
-from vatsloc.workflow.pneumothorax import Collapse, collapse
+from vatsloc.workflow.parted import in_pieces
+from vatsloc.workflow.pneumothorax import Collapse, collapse, refined
+from vatsloc.workflow.pose import ChangeOfPose
 from vatsloc.workflow.settings import Settings
 from vatsloc.workflow.stages import Say, Stages, quiet
 
@@ -86,7 +88,8 @@ def _rows(scene: Scene, other: Case | None, found: Localization) -> list[tuple[s
     rows = [("nothing", score(found, scene.truth))]
     for name, fault in FAULTS.items():
         moved = fault(found.collapse.mesh_before.points, found.collapse.points_after, np.random.default_rng(0))
-        rows.append((name, score(_answered(scene, replace(found.collapse, points_after=moved)), scene.truth)))
+        wrong = replace(found.collapse, points_after=moved)
+        rows.append((name, score(_answered(scene, found.pose, wrong), scene.truth)))
     for name, run in _whole_runs(scene, other).items():
         try:
             rows.append((name, score(run(), scene.truth)))
@@ -112,12 +115,15 @@ def _whole_runs(scene: Scene, other: Case | None) -> dict[str, Callable[[], Loca
 
 def _finished(scene: Scene) -> Localization:
     """The rest of a run, from its observations on."""
-    return _answered(scene, collapse(scene.case, scene.prepared, scene.pose, scene.observed, scene.settings, Stages()))
-
-
-def _answered(scene: Scene, found: Collapse) -> Localization:
     stages = Stages()
-    answer = locate_nodule(scene.case, scene.prepared, scene.pose, found, scene.settings, stages)
+    found = collapse(scene.case, scene.prepared, scene.pose, scene.observed, scene.settings, stages)
+    pose, found = in_pieces(scene.prepared, scene.pose, found, scene.settings, stages)
+    return _answered(scene, pose, refined(scene.case, scene.prepared, pose, found, scene.settings, stages))
+
+
+def _answered(scene: Scene, pose: ChangeOfPose, found: Collapse) -> Localization:
+    stages = Stages()
+    answer = locate_nodule(scene.case, scene.prepared, pose, found, scene.settings, stages)
     return checked(scene.case, answer, scene.settings, stages)
 
 
