@@ -23,6 +23,10 @@ HINGE_MM = 13.0
 """Around the hilum, tissue of a lung in lobes is tied to the mediastinum this far, so that lobes may swing."""
 ROOT_KPA_MM = 300.0
 """Stiffness a point of the root's tie to the mediastinum."""
+HELD_LEAST = 0.5
+"""Rest volume over that in the CT, at least, of lung that the wall holds open. Under 0.30 tissue resists less the more
+it is stretched, and one lobe would empty into another; at 0.5 what is emptier by two deviations is still above that.
+"""
 SCAR_KPA_MM = 300.0
 """Stiffness a point of the pleura's tie to the wall where the two have grown together."""
 
@@ -79,12 +83,13 @@ def _look(cavity: Lattice, collapse: Collapse, gravity: Array, airless: Lattice 
 
 @dataclass(frozen=True)
 class LungBody:
-    """The operated lung as a body that settles under loads. surface: points (n, 3) mm, areas (n,), lobes (n,); tied:
-    (n,) the tissue that belongs to the hilum; root: factor on how firmly it is held; grown: (n,) the surface that has
-    grown to the chest wall."""
+    """The operated lung as a body that settles under loads. tissue, held: free, and where the wall holds it open;
+    surface: points (n, 3) mm, areas (n,), lobes (n,); tied: (n,) the tissue that belongs to the hilum; root: factor on
+    how firmly it is held; grown: (n,) the surface that has grown to the chest wall."""
 
     patient: Patient
     tissue: Tissue
+    held: Tissue
     surface: tuple[Array, Array, Array]
     tied: Array
     root: float
@@ -95,7 +100,7 @@ class LungBody:
         self, motion: CageMotion, gravity: Array, held: bool, volume_ratio: float | None = None
     ) -> tuple[Lattice, Equilibrium]:
         """The lung's room after the walls' motion, as a signed distance (mm), and the lung at rest in it."""
-        lung, t = self.patient.lung, self.tissue
+        lung, t = self.patient.lung, self.held if held else self.tissue
         cavity = motion.carry(lung)
         skin, _, lobe = (column[self.grown] for column in self.surface)
         ties = [Tie(t.points[self.tied], motion(t.points[self.tied]), self.root * ROOT_KPA_MM, t.lobe[self.tied])]
@@ -119,19 +124,26 @@ def lung_body(
     points, volume, lobe = _by_lobe([tissue_points(region, element_mm / 2) for region in lobes.regions])
     surface = _by_lobe([surface_points(region, 2) for region in lobes.regions])
     tied = np.linalg.norm(points - patient.hilum, axis=1) < (20.0 if len(lobes.regions) == 1 else HINGE_MM)
-    shear, slack = _uneven(patient, points, lobe, collapse, rng)
-    if airless is not None:
-        share = airless.sample(points)
-        shear, slack = shear * (1 + 2 * share), slack * (1 - 0.45 * share)
+    shear, slack = _uneven(patient, points, collapse, rng)
     if disease is not None:
         trapped, scarred = (
             of(patient.lung, disease, patient.seed).sample(points) for of in (emphysema_of, fibrosis_of)
         )
         shear, slack = shear * (1 + 4 * scarred) * (1 - 0.4 * trapped), slack * (1 + 0.7 * trapped)
-    rest = np.cbrt(np.clip(collapse.deflated * slack, 0.15, 0.95))
-    tissue = Tissue(points, volume, shear, rest, 165.0, lobe)
+    held = Tissue(points, volume, shear, _rest(max(collapse.deflated, HELD_LEAST), slack), 165.0, lobe)
+    # Lobes trap gas or empty, and tissue loses its last gas, once the wall has let go.
+    slack = slack * np.exp(collapse.lobes_apart * _odds(len(lobes.regions), patient.seed))[lobe]
+    if airless is not None:
+        share = airless.sample(points)
+        shear, slack = shear * (1 + 2 * share), slack * (1 - 0.45 * share)
+    tissue = replace(held, shear=shear, rest=_rest(collapse.deflated, slack))
     grown = _grown_to_wall(surface[0], patient, collapse.adhesion)
-    return LungBody(patient, tissue, surface, tied, collapse.root, grown, element_mm)
+    return LungBody(patient, tissue, held, surface, tied, collapse.root, grown, element_mm)
+
+
+def _rest(ratio: float, slack: Array) -> Array:
+    """Rest length (n,) over length in the CT of tissue that collapses to `ratio` of its volume times `slack` (n,)."""
+    return np.asarray(np.cbrt(np.clip(ratio * slack, 0.15, 0.95)))
 
 
 def _grown_to_wall(points: Array, patient: Patient, radius: float) -> Array:
@@ -160,16 +172,13 @@ def _pleura(surface: tuple[Array, Array, Array], lung: Lattice, cavity: Lattice,
     return Pleura(points[outer], area[outer], cavity, held, lobe[outer])
 
 
-def _uneven(
-    patient: Patient, points: Array, lobe: Array, collapse: Collapse, rng: np.random.Generator
-) -> tuple[Array, Array]:
+def _uneven(patient: Patient, points: Array, collapse: Collapse, rng: np.random.Generator) -> tuple[Array, Array]:
     """Shear modulus (kPa) and factor on the rest volume: patchy tissue, soft fissure, stiff root, airless tissue and
     nodule."""
     patchiness = collapse.patchiness
     lung, hilum = patient.lung, patient.hilum
     shear = 0.65 * collapse.stiffness * np.exp(0.45 * patchiness * lung.like(smooth_noise(lung, 32.0, rng)).at(points))
     slack = np.exp(0.22 * patchiness * lung.like(smooth_noise(lung, 38.0, rng)).at(points))
-    slack *= np.exp(collapse.lobes_apart * _odds(len(patient.lobes.regions), patient.seed))[lobe]
     shear *= 1 + 5 * collapse.root * np.exp(-((np.linalg.norm(points - hilum, axis=1) / 24) ** 2))
     fissures = patient.lobes.fissures
     shear *= 1 - 0.85 * np.exp(-((fissures.distance(points) / 8) ** 2)) * fissures.grown(points)

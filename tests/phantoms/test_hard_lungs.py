@@ -14,7 +14,7 @@ from phantoms.fields import patches
 from phantoms.imaging import AIRLESS_HU, FLUID_HU, PLEURAL_AIR_HU, Look, State, image_state
 from phantoms.ports import draw_ports
 from phantoms.spec import Collapse, Disease, Lesion
-from phantoms.states import airless_of
+from phantoms.states import airless_of, lung_body
 from phantoms.thorax import draw_thorax, operated_lung
 from phantoms.voxels import Array, Grid, Image
 
@@ -64,6 +64,22 @@ def test_a_nodule_is_shown_by_the_images_that_are_to_show_it(
 def test_an_unknown_way_to_be_seen_is_refused() -> None:
     with pytest.raises(ValueError, match="a lesion is seen in 'all', 'ct and inflated' or 'ct', got 'never'"):
         make_case(replace(COARSE, lesion=Lesion(seen="never")))
+
+
+def test_what_empties_lobes_and_tissue_acts_only_when_the_wall_has_let_go(lobed: PhantomCase) -> None:
+    hard = Collapse(0.86, 0.28, lobes_apart=0.3, airless=0.3)
+    gas = airless_of(lobed.patient, hard, np.array([-1.0, 0.0, 0.0]))
+    calm, torn = (
+        lung_body(lobed.patient, collapse, 28.0, np.random.default_rng(0), None, airless)
+        for collapse, airless in ((replace(hard, lobes_apart=0.0), None), (hard, gas))
+    )
+    assert_allclose(torn.held.rest, calm.held.rest, rtol=1e-12)
+    assert_allclose(torn.held.shear, calm.held.shear, rtol=1e-12)
+    # Neo-Hookean tension is greatest at a stretch of 1.5; beyond, what is stretched more pulls less.
+    assert np.quantile(1 / torn.held.rest, 0.95) < 1.45
+    assert np.median(1 / calm.tissue.rest) > 1.5
+    emptied = [np.mean((torn.tissue.rest / calm.tissue.rest)[torn.tissue.lobe == lobe] ** 3) for lobe in range(3)]
+    assert max(emptied) / min(emptied) > 1.5
 
 
 def test_airless_tissue_is_dense_and_as_large_as_asked_and_hangs(demo: PhantomCase) -> None:
