@@ -69,7 +69,7 @@ def match_affine_blocks(
 
     affines: (n, 3, 4), from a voxel's offset from its start to a voxel of the moving image. sure: the NCC from which a
     block found within NEAR voxels is taken without a look at those farther off, and every second one of those suffices;
-    three times faster. The way back is looked for within NEAR voxels then. Without it the best of all shifts is found.
+    twice as fast. The way back is looked for within NEAR voxels then. Without it the best of all shifts is found.
     """
     n = len(starts)
     best = _Best(np.zeros((n, 3), np.int64), np.full((n, 27), -1, np.float32), np.zeros((n, 3), np.int64))
