@@ -146,8 +146,10 @@ def running(
 
 
 def status(node: Running, patient: str) -> dict:
-    """What the node says of a patient on disk."""
-    found: dict = json.loads((node.cases / patient_folder(patient) / "status.json").read_text())
+    """What the node says of a patient on disk, as soon as it says something."""
+    file = node.cases / patient_folder(patient) / "status.json"
+    node.wait(file.exists)
+    found: dict = json.loads(file.read_text())
     return found
 
 

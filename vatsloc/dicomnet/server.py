@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import socket
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from itertools import count
 from typing import Any
 from weakref import WeakKeyDictionary
@@ -44,6 +45,7 @@ def serving(
     node.require_calling_aet = list(allow)
     desk = _Desk(store, say)
     handlers: list[Any] = [
+        (evt.EVT_DATA_SENT, confirm_the_next_at_once),
         (evt.EVT_C_STORE, desk.store_image),
         (evt.EVT_C_ECHO, lambda event: 0x0000),
         (evt.EVT_RELEASED, desk.released),
@@ -108,6 +110,18 @@ class _Desk:
         # Release and close come from two threads in either order, so a name lives as long as its association.
         with self._lock:
             return self._names.setdefault(event.assoc, f"{self.store.token}-{next(self._numbers)}")
+
+
+def confirm_the_next_at_once(event: Any) -> None:
+    """Ask the system, after an answer was sent, to confirm what comes next as soon as it comes.
+
+    A sender that gathers small writes (Nagle's algorithm, dcmtk's default) holds an image back until its announcement
+    is confirmed, and Linux waits 40 ms with that after an answer: 20 s for a scan of 500 images. The system forgets
+    the wish with the next answer.
+    """
+    if hasattr(socket, "TCP_QUICKACK") and (connection := event.assoc.dul.socket) is not None:
+        with suppress(OSError, AttributeError):  # the connection may be gone by now
+            connection.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
 
 
 def _caller(event: Any) -> str:
