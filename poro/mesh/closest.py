@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from scipy.spatial import cKDTree
 
 from poro.arrays import Array
+from poro.mesh.parts import share_out
 from poro.mesh.tetmesh import TriSurface
 
 CLUSTER = 8  # triangles per bounding sphere
+FEW = 1000  # queries that one thread answers sooner than two
 
 
 @dataclass(frozen=True)
@@ -42,7 +45,14 @@ def closest_points(surface: TriSurface, queries: Array) -> ClosestPoints:
     centres = np.add.reduceat(sorted_x.mean(axis=1), starts) / np.diff(np.append(starts, len(order)))[:, None]
     reach = np.linalg.norm(sorted_x - np.repeat(centres, CLUSTER, axis=0)[: len(order), None], axis=2).max(axis=1)
     radii = np.maximum.reduceat(reach, starts)
-    found, bary = _search(queries, sorted_x, centres, radii, place[tree.query(queries)[1]])
+    guess = place[tree.query(queries)[1]]
+    found, bary = np.empty(len(queries), np.int64), np.empty((len(queries), 3))
+    clusters = _Clusters(sorted_x, centres, radii)
+    share_out(
+        lambda first, end: _search(queries, clusters, guess, found, bary, first, end),
+        len(queries),
+        FEW,
+    )
     triangle = order[found]
     points = np.einsum("qk,qkd->qd", bary, x[triangle])
     offset = queries - points
@@ -53,12 +63,21 @@ def closest_points(surface: TriSurface, queries: Array) -> ClosestPoints:
     return ClosestPoints(points, triangle, bary, sign * np.linalg.norm(offset, axis=1))
 
 
-@njit(cache=True, parallel=True)
-def _search(queries: Array, x: Array, centres: Array, radii: Array, guess: Array) -> tuple[Array, Array]:
-    """Nearest triangle and weights, clusters of triangles skipped when their sphere lies beyond the best so far."""
-    found = np.empty(len(queries), np.int64)
-    bary = np.empty((len(queries), 3))
-    for q in prange(len(queries)):
+class _Clusters(NamedTuple):
+    """CLUSTER triangles (t, 3, 3) mm each that lie together, and the spheres (c, 3), (c,) mm about them."""
+
+    triangles: Array
+    centres: Array
+    radii: Array
+
+
+@njit(cache=True, nogil=True)
+def _search(queries, clusters, guess, found, bary, begin, end):
+    """Nearest triangle (q,) and weights (q, 3) of queries begin..end, clusters of triangles skipped when their sphere
+    lies beyond the best so far.
+    """
+    x, centres, radii = clusters
+    for q in range(begin, end):
         px, py, pz = queries[q, 0], queries[q, 1], queries[q, 2]
         best = guess[q]
         v, w, least = _project(px, py, pz, x[best])
@@ -72,7 +91,6 @@ def _search(queries: Array, x: Array, centres: Array, radii: Array, guess: Array
                         v, w, least, best, reach = tv, tw, gap, t, np.sqrt(gap)
         found[q] = best
         bary[q, 0], bary[q, 1], bary[q, 2] = 1 - v - w, v, w
-    return found, bary
 
 
 @njit(cache=True)

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from poro.arrays import Array
 from poro.mesh.closest import closest_points
+from poro.mesh.parts import share_out
 from poro.mesh.tetmesh import TetMesh
+
+FEW = 5000  # points that one thread locates sooner than two
 
 
 @dataclass(frozen=True)
@@ -35,15 +37,9 @@ def locate(mesh: TetMesh, points: Array, nearest: bool = True) -> Location:
     points = np.ascontiguousarray(points, float)
     if points.ndim != 2 or points.shape[1] != 3:
         raise ValueError(f"points must be (q, 3), got {points.shape}")
-    x = mesh.points[mesh.tets]
-    lower, upper = x.min(axis=1), x.max(axis=1)
-    origin = mesh.points.min(axis=0)
-    width = float(np.cbrt(np.abs(mesh.volumes).mean() * 6))
-    shape = np.floor((mesh.points.max(axis=0) - origin) / width).astype(np.int64) + 1
-    first = np.clip(((lower - origin) / width).astype(np.int64), 0, shape - 1)
-    last = np.clip(((upper - origin) / width).astype(np.int64), 0, shape - 1)
-    cells = _Cells(origin, width, shape, *_bins(first, last, shape))
-    tet, bary = _search(points, x[:, 0].copy(), mesh.gradients, cells)
+    tet, bary = np.full(len(points), -1), np.zeros((len(points), 4))
+    corner, gradients, cells = mesh.points[mesh.tets[:, 0]], mesh.gradients, mesh.cells
+    share_out(lambda begin, end: _search(points, corner, gradients, cells, tet, bary, begin, end), len(points), FEW)
     nodes = mesh.tets[np.maximum(tet, 0)]
     distance = np.zeros(len(points))
     lost = np.flatnonzero(tet < 0)
@@ -65,44 +61,11 @@ def interpolate(location: Location, nodal: Array) -> Array:
     return np.einsum("qk,qk...->q...", location.barycentric, nodal[location.nodes])
 
 
-class _Cells(NamedTuple):
-    """Uniform grid of cubes of `width` mm from `origin` (3,), and the tetrahedra in each, as compressed rows."""
-
-    origin: Array
-    width: float
-    shape: Array
-    start: Array
-    members: Array
-
-
-@njit(cache=True)
-def _bins(first: Array, last: Array, shape: Array) -> tuple[Array, Array]:
-    """Tetrahedra whose boxes touch each cell of a uniform grid, as compressed rows."""
-    start = np.zeros(shape[0] * shape[1] * shape[2] + 1, np.int64)
-    for t in range(len(first)):
-        for i in range(first[t, 0], last[t, 0] + 1):
-            for j in range(first[t, 1], last[t, 1] + 1):
-                for k in range(first[t, 2], last[t, 2] + 1):
-                    start[(i * shape[1] + j) * shape[2] + k + 1] += 1
-    start = np.cumsum(start)
-    members = np.empty(start[-1], np.int64)
-    fill = start[:-1].copy()
-    for t in range(len(first)):
-        for i in range(first[t, 0], last[t, 0] + 1):
-            for j in range(first[t, 1], last[t, 1] + 1):
-                for k in range(first[t, 2], last[t, 2] + 1):
-                    cell = (i * shape[1] + j) * shape[2] + k
-                    members[fill[cell]] = t
-                    fill[cell] += 1
-    return start, members
-
-
-@njit(cache=True, parallel=True)
-def _search(points: Array, corner: Array, gradients: Array, cells: _Cells) -> tuple[Array, Array]:
+@njit(cache=True, nogil=True)
+def _search(points, corner, gradients, cells, found, bary, begin, end):
+    """Tetrahedron (q,) and weights (q, 4) of points begin..end; left as they are for points outside."""
     origin, width, shape, start, members = cells
-    found = np.full(len(points), -1)
-    bary = np.zeros((len(points), 4))
-    for q in prange(len(points)):
+    for q in range(begin, end):
         i = int(np.floor((points[q, 0] - origin[0]) / width))
         j = int(np.floor((points[q, 1] - origin[1]) / width))
         k = int(np.floor((points[q, 2] - origin[2]) / width))
@@ -122,4 +85,3 @@ def _search(points: Array, corner: Array, gradients: Array, cells: _Cells) -> tu
                 found[q] = t
                 bary[q, 0], bary[q, 1], bary[q, 2], bary[q, 3] = w0, w1, w2, w3
                 break
-    return found, bary

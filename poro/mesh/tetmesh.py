@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from poro.arrays import Array
+from poro.mesh.cells import Cells, cells_of
 
 # Faces of a positively oriented tetrahedron, seen anticlockwise from outside.
 FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
@@ -49,6 +50,11 @@ class TetMesh:
     def node_volumes(self) -> Array:
         """A quarter of the volume of the tetrahedra around each node, (n,) mm3."""
         return np.bincount(self.tets.ravel(), np.repeat(self.volumes / 4, 4), len(self.points))
+
+    @cached_property
+    def cells(self) -> Cells:
+        """Grid in which the tetrahedra about a point are found."""
+        return cells_of(self.points, self.tets, self.volumes)
 
     @cached_property
     def boundary(self) -> TriSurface:
