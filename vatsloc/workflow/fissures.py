@@ -28,7 +28,7 @@ LEAST_DEEP_MM = 10.0
 """Gas whose border lay so deep below the pleura has come into the lung."""
 BESIDE_MM = 8.0
 LEAST_GAS, LEAST_GAS_SHARE = 40, 0.6
-MOST_COST = 0.75
+MOST_COST = 0.95
 """Of the cost of one smooth map, what two have to come down to."""
 STARTS = 3
 SLOPES, TILTS, OFFSETS_MM = (0.0, 0.4, 0.7, 0.9, 1.2, 1.6), (-0.4, 0.0, 0.4), np.arange(-48.0, 49.0, 8.0)

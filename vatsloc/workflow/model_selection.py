@@ -34,6 +34,7 @@ from vatsloc.workflow.hold_out import held_out, too_few
 from vatsloc.workflow.keypoints import find_correspondences
 from vatsloc.workflow.observe import Observed
 from vatsloc.workflow.prepare import Prepared
+from vatsloc.workflow.refinement import unfolded
 from vatsloc.workflow.settings import Settings
 from vatsloc.workflow.stages import Stages
 
@@ -221,8 +222,9 @@ def corrected(strain: float, settings: FitSettings) -> Step:
         wanted = constraints_to(target, mesh, model.displacement, settings)
         found = elastic_correction(mesh, model.displacement, model.system.tissue, wanted, strain)
         inverted, before = ((det <= 0).mean() for det in (found.det_f, model.fit.state.det_f))
+        field = found.u
         if inverted > max(before, MOST_INVERTED):
-            return model
-        return replace(model, displacement=model.displacement + found.u)
+            field = unfolded(mesh.points + model.displacement, field, mesh.tets)
+        return replace(model, displacement=model.displacement + field)
 
     return step
