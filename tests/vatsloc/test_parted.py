@@ -268,7 +268,7 @@ def in_one_piece(
     ("fissure", "why"),
     [
         (None, "too few keypoints to tell pieces apart"),
-        (replace(FLAT, cost_share=0.9), "two smooth maps cost 0.90 of one at keypoints"),
+        (replace(FLAT, cost_share=0.97), "two smooth maps cost 0.97 of one at keypoints"),
         (replace(FLAT, gas=10), "of 10 points of gas lie along a sheet"),
         (replace(FLAT, gas_share=0.3), "30 % of 100 points of gas"),
     ],
