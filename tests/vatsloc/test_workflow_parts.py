@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from pathlib import Path
 
 import numpy as np
@@ -144,6 +145,17 @@ def test_what_was_begun_is_taken_by_its_own_stage_alone_and_what_fails_is_named_
     assert threading.get_ident() not in {thread for _, thread in ran}
     with pytest.raises(InputRefused, match="no spine"), stages.stage("two", "CT"):
         stages.done(lambda: 5)
+    gate.clear()
+    stages.begin("five", "CT", lambda: begun(8))
+    stages.begin("six", "inflated CBCT", failing)
+    stages.fail_early()  # nothing of it has failed yet: the second waits for the first
+    gate.set()
+    with stages.stage("five", "CT"):
+        assert stages.done(lambda: 5) == 8
+    with pytest.raises(InputRefused, match="inflated CBCT: no spine"):
+        for _ in range(1000):
+            stages.fail_early()
+            time.sleep(0.01)
     gate.clear()
     stages.begin("three", "", lambda: begun(6))
     stages.begin("four", "", lambda: begun(7))

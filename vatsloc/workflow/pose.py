@@ -113,6 +113,7 @@ def change_of_pose(
     with stages.stage("mesh", CT):
         mesh = stuff(prepared.lung_ct.inside, prepared.lung_ct.ras_from_ijk, settings.mesh.edge_mm)
     placed = TetMesh(inf_from_ct_rigid(mesh.points), mesh.tets)
+    stages.fail_early()  # before what takes long
     if not settings.registration.on:
         stages.skip("free-form deformation", "switched off in the settings")
         nowhere = np.zeros(len(mesh.points), dtype=bool)

@@ -81,7 +81,7 @@ class Stages:
         """Begin the work of the stage `name` on a second thread, after what was begun before; what is returned waits
         for it. `forget` has to follow.
 
-        Nothing with numba's own parallel loops may be begun: they serve one thread at a time.
+        Nothing with numba's own parallel loops may be begun (a run has none): they serve one thread at a time.
         """
         if self._beside is None:
             self._beside = ThreadPoolExecutor(1, thread_name_prefix="beside")
@@ -92,6 +92,13 @@ class Stages:
         """Result of the work of the stage at work: of what was begun for it, else of doing it now."""
         begun = self._begun.pop((self._name, self._image), None)
         return work() if begun is None else begun.result()
+
+    def fail_early(self) -> None:
+        """Raise what something that was begun has failed with by now, as its own stage would do later."""
+        for (name, image), future in self._begun.items():
+            if future.done() and future.exception() is not None:
+                with self.stage(name, image):
+                    future.result()
 
     def forget(self) -> None:
         """Drop what was begun and not asked for; what is at work ends by itself."""
