@@ -303,3 +303,22 @@ def test_a_piece_too_thin_for_an_element_is_not_cut_off() -> None:
     beside = replace(FLAT, sheet=Sheet(known.CENTRE, np.array([0, 0, known.RADIUS_MM + 5, 0, 0, 0])))
     with pytest.raises(ValueError, match="no element"):
         cut_lung(known.scene().prepared, beside, 8.0)
+
+
+@pytest.mark.parametrize(
+    ("residual", "limit_mm", "runs"), [(True, -1.0, True), (True, 1.9, True), (True, 2.0, False), (False, -1.0, False)]
+)
+def test_pieces_are_registered_each_for_itself_where_a_whole_lung_would_be(
+    monkeypatch: pytest.MonkeyPatch, residual: bool, limit_mm: float, runs: bool
+) -> None:
+    pose, parted = cut()
+    parted = replace(parted, model=replace(parted.model, refinements=(Refinement("two pieces", 3.0, 2.0, True),)))
+    marked = replace(parted, points_after=parted.points_after + 1)
+    monkeypatch.setattr(module, "seen_fissure", lambda _pose, _collapse: FLAT)
+    monkeypatch.setattr(module, "_fitted", lambda *_: (pose, parted))
+    monkeypatch.setattr(module, "_with_residual", lambda *_: marked)
+    tables = {"residual": {"on": residual}, "leave_out": {"residual_mm": limit_mm}}
+    scene = known.scene().with_model(refinements=(Refinement("regional fit", 3.0, 2.0, True),))
+    found = in_pieces(scene.prepared, scene.pose, scene.collapse, Settings.model_validate(tables), Stages())[1]
+    assert (found is marked) is runs
+    assert (found is parted) is not runs
