@@ -59,10 +59,14 @@ def test_few_keypoints_tell_nothing() -> None:
 @pytest.mark.parametrize(
     ("fissure", "evidence"),
     [
-        (Fissure(TRUE, 0.95, 40, 0.6, 400), ("keypoints", "gas")),
-        (Fissure(TRUE, 0.96, 40, 0.6, 400), ("gas",)),
-        (Fissure(TRUE, 0.95, 39, 0.6, 400), ("keypoints",)),
-        (Fissure(TRUE, 0.95, 40, 0.59, 400), ("keypoints",)),
+        (Fissure(TRUE, 0.75, 40, 0.6, 400), ("keypoints", "gas")),
+        (Fissure(TRUE, 0.76, 40, 0.6, 400), ("gas",)),
+        (Fissure(TRUE, 0.75, 39, 0.6, 400), ("keypoints",)),
+        (Fissure(TRUE, 0.75, 40, 0.59, 400), ("keypoints",)),
+        (Fissure(TRUE, 0.95, 40, 0.67, 400), ("keypoints", "gas")),
+        (Fissure(TRUE, 0.95, 40, 0.66, 400), ("gas",)),
+        (Fissure(TRUE, 0.95, 39, 0.67, 400), ()),
+        (Fissure(TRUE, 0.96, 40, 0.67, 400), ("gas",)),
     ],
 )
 def test_evidence_has_limits(fissure: Fissure, evidence: tuple[str, ...]) -> None:

@@ -34,6 +34,7 @@ from vatsloc.workflow.model_selection import (
     _regional,
     corrected,
     fit_settings,
+    held_back,
     held_out,
     select_refinement,
     surface_target,
@@ -165,7 +166,7 @@ def test_settings_of_a_run_reach_the_fit() -> None:
     ("share", "before", "whole"),
     [(0.0005, 0.0, True), (0.002, 0.0, False), (0.002, 0.002, True), (0.004, 0.002, False)],
 )
-def test_a_correction_that_turns_more_elements_inside_out_is_held_back_at_these_alone(
+def test_a_correction_that_turns_more_elements_inside_out_is_refused_or_held_back_at_these_alone(
     monkeypatch: pytest.MonkeyPatch, share: float, before: float, whole: bool
 ) -> None:
     start = a_model(0.3)
@@ -187,6 +188,9 @@ def test_a_correction_that_turns_more_elements_inside_out_is_held_back_at_these_
     monkeypatch.setattr(module, "elastic_correction", elastic_correction)
     target, settings = a_surface(), FitSettings(keypoint_sigma_mm=1.25)
     found = corrected(0.03, settings)(start, target, start.fit)
+    assert (found is not start) is whole
+    if not whole:
+        found = held_back(0.03, settings)(start, target, start.fit)
     moved = found.displacement - start.displacement
     around = (mesh.tets == point).any(axis=1)
     if whole:
@@ -199,6 +203,7 @@ def test_a_correction_that_turns_more_elements_inside_out_is_held_back_at_these_
         assert_allclose(moved[~np.isin(np.arange(len(moved)), mesh.tets[around])], 0.5)
     assert asked[0] == (target, start.system.mesh, start.displacement, settings)
     assert asked[1] == (start.system.mesh, start.displacement, "constraints", 0.03)
+    assert asked[2:] == ([] if whole else asked[:2])
 
 
 @pytest.mark.parametrize(("hilum", "count"), [(True, 12), (False, 6)])

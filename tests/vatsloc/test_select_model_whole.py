@@ -37,10 +37,10 @@ from vatsloc.workflow.stages import Stages
 
 class Selection:
     """`select_model` with a plain fit that knows 20 % of the collapse, and corrections that know all of it when shown
-    all.
+    all; whole_fields: False where these have to be held back at some nodes.
     """
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, pairs: Correspondences) -> None:
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, pairs: Correspondences, whole_fields: bool = True) -> None:
         lung = mesh()
         self.plain = a_fit(0.1 * motion(lung.points))
         self.solid = a_fit(0.2 * motion(lung.points)).state
@@ -69,7 +69,12 @@ class Selection:
             assert data == fit_settings(self.settings)
             return lambda m, t, s: knows(1.0 if len(t.inflated) == whole else 0.7)(m, t, s)
 
-        monkeypatch.setattr(module, "corrected", corrected)
+        def refused(_strain: float, data: FitSettings) -> Any:
+            assert data == fit_settings(self.settings)
+            return lambda m, t, s: m
+
+        monkeypatch.setattr(module, "corrected", corrected if whole_fields else refused)
+        monkeypatch.setattr(module, "held_back", refused if whole_fields else corrected)
 
     def _asked(self, name: str, answer: Any) -> Any:
         def ask(*values: Any, **named: Any) -> Any:
@@ -149,3 +154,13 @@ def test_the_regional_fit_is_tried_unless_it_is_switched_off(
     monkeypatch.setattr(module, "_regional", lambda _settings: lambda m, t, s: knows(0.9)(m, t, s))
     known.run(model=model)
     assert ("regional fit" in known.stages.seconds) is tried
+
+
+def test_corrections_are_held_back_at_some_nodes_where_none_can_be_taken_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    known = Selection(monkeypatch, pairs_of(), whole_fields=False)
+    model = known.run()
+    assert_allclose(model.displacement, motion(known.observed.model_mesh.points))
+    names = [f"elastic correction, strain {s:g}" for s in (0.05, 0.025, 0.0125)]
+    assert [refinement.name for refinement in model.refinements] == [*names, *(f"{name}, held back" for name in names)]
+    assert [refinement.kept for refinement in model.refinements[:3]] == [False, False, False]
+    assert sum(refinement.kept for refinement in model.refinements) == 1

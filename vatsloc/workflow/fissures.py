@@ -28,8 +28,10 @@ LEAST_DEEP_MM = 10.0
 """Gas whose border lay so deep below the pleura has come into the lung."""
 BESIDE_MM = 8.0
 LEAST_GAS, LEAST_GAS_SHARE = 40, 0.6
-MOST_COST = 0.95
+MOST_COST = 0.75
 """Of the cost of one smooth map, what two have to come down to."""
+CLEAR_GAS_SHARE, MOST_COST_BESIDE_IT = 2 / 3, 0.95
+"""Where so much of the gas lies along the sheet, keypoints need to say less: most may lie in one lobe."""
 STARTS = 3
 SLOPES, TILTS, OFFSETS_MM = (0.0, 0.4, 0.7, 0.9, 1.2, 1.6), (-0.4, 0.0, 0.4), np.arange(-48.0, 49.0, 8.0)
 USUAL, SPREAD = np.array([0.9, 0.0, 0.0, 0.0, 0.0, 0.0]), np.array([0.6, 0.5, 40.0, 10.0, 10.0, 10.0])
@@ -76,7 +78,8 @@ class Fissure:
     def evidence(self) -> tuple[str, ...]:
         """What supports a cut: "keypoints", "gas"."""
         parted = self.gas >= LEAST_GAS and self.gas_share >= LEAST_GAS_SHARE
-        return (*(("keypoints",) if self.cost_share <= MOST_COST else ()), *(("gas",) if parted else ()))
+        most_cost = MOST_COST_BESIDE_IT if parted and self.gas_share >= CLEAR_GAS_SHARE else MOST_COST
+        return (*(("keypoints",) if self.cost_share <= most_cost else ()), *(("gas",) if parted else ()))
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,16 @@ from poro.collapse import (
 from poro.collapse import StrainMeasure as Strain
 from poro.collapse.choice import StrainChoice
 from poro.fem import Tissue, neo_hookean
-from poro.fit import Fit, FitSettings, FitStatus, Target, constraints_to, elastic_correction, fit_collapse
+from poro.fit import (
+    Fit,
+    FitSettings,
+    FitStatus,
+    Target,
+    constraints_to,
+    elastic_correction,
+    fit_collapse,
+)
+from poro.fit.elastic_correction import ElasticCorrection
 from poro.mesh import TetMesh, interpolate, locate
 from registration.correspondences import Correspondences
 from registration.volume import Array
@@ -133,9 +142,15 @@ def refined_model(
             model, training_only = select_refinement(steps, model, training_only, surface)
     if settings.model.correct:
         with stages.stage("elastic correction"):
-            data = fit_settings(settings)
+            data, before = fit_settings(settings), model.refinements
             steps = {f"elastic correction, strain {strain:g}": corrected(strain, data) for strain in CORRECTION_STRAINS}
             model, training_only = select_refinement(steps, model, training_only, surface)
+            if not any(refinement.kept for refinement in model.refinements[len(before) :]):
+                steps = {
+                    f"{name}, held back": held_back(strain, data)
+                    for strain, name in zip(CORRECTION_STRAINS, steps, strict=True)
+                }
+                model, training_only = select_refinement(steps, model, training_only, surface)
     return model, training_only
 
 
@@ -218,13 +233,27 @@ def corrected(strain: float, settings: FitSettings) -> Step:
     """An elastic field on top; the model unchanged where that would invert more elements."""
 
     def step(model: CollapseModel, target: Target, _start: Fit) -> CollapseModel:
-        mesh = model.system.mesh
-        wanted = constraints_to(target, mesh, model.displacement, settings)
-        found = elastic_correction(mesh, model.displacement, model.system.tissue, wanted, strain)
+        found = _correction(strain, settings, model, target)
         inverted, before = ((det <= 0).mean() for det in (found.det_f, model.fit.state.det_f))
-        field = found.u
         if inverted > max(before, MOST_INVERTED):
-            field = unfolded(mesh.points + model.displacement, field, mesh.tets)
-        return replace(model, displacement=model.displacement + field)
+            return model
+        return replace(model, displacement=model.displacement + found.u)
 
     return step
+
+
+def held_back(strain: float, settings: FitSettings) -> Step:
+    """The same field, made smaller at the nodes of elements that it would invert."""
+
+    def step(model: CollapseModel, target: Target, _start: Fit) -> CollapseModel:
+        now, mesh = model.displacement, model.system.mesh
+        field = unfolded(mesh.points + now, _correction(strain, settings, model, target).u, mesh.tets)
+        return replace(model, displacement=now + field)
+
+    return step
+
+
+def _correction(strain: float, settings: FitSettings, model: CollapseModel, target: Target) -> ElasticCorrection:
+    mesh = model.system.mesh
+    wanted = constraints_to(target, mesh, model.displacement, settings)
+    return elastic_correction(mesh, model.displacement, model.system.tissue, wanted, strain)
