@@ -258,3 +258,22 @@ def test_air_beside_a_lung_of_every_density_is_told_by_its_own_width(share_of_lu
     if seen:
         assert contrast == pytest.approx(150, abs=20)
         assert -815 < limit < -765
+
+
+def test_air_is_told_from_a_lung_that_is_still_light_and_has_a_dense_tail() -> None:
+    """Gas about -980 HU, lung about -830 with a tail of vessels up to -350: Otsu's level lies in the lung."""
+    random = np.random.default_rng(4)
+    lung = np.concatenate([random.normal(-830, 40, 26000), random.triangular(-830, -830, -350, 14000)])
+    limit, contrast = air_limit(np.concatenate([random.normal(-980, 25, 8000), lung]))
+    assert contrast == pytest.approx(150, abs=25)
+    assert -925 < limit < -885
+    assert air_limit(lung)[1] == 0.0  # the lung alone
+
+
+def test_air_that_the_image_clips_is_told_from_a_lung_of_every_density() -> None:
+    """Half of the gas about -1010 HU is written as -1024, so its peak has no dark flank."""
+    random = np.random.default_rng(5)
+    gas, lung = np.maximum(random.normal(-1010, 30, 16000), -1024), random.uniform(-980, -350, 24000)
+    limit, contrast = air_limit(np.concatenate([gas, lung]))
+    assert contrast == pytest.approx(150, abs=30)
+    assert -950 < limit < -900

@@ -26,6 +26,9 @@ AIR_WIDTHS = 2.5
 LEAST_BESIDE_AIR = 0.25
 """Share of the voxels that lies as far again beyond that level; 6 to 15 % of an inflated lung lie so far from its peak.
 """
+CLIPPED_HU, CLIPPED_SHARE = 30.0, 0.01
+"""How wide air is where a peak lies nearer to the darkest level than that; share of the voxels at a level that an image
+was clipped at."""
 AIR_PIECE_ML = 0.5
 LUNG_PIECE_ML = 5.0
 
@@ -106,35 +109,61 @@ def _pleural_air(
 
 
 def air_limit(hu: Array) -> tuple[float, float]:
-    """HU half-way between pleural air and lung, and their distance: Otsu's two classes, then their peaks."""
+    """HU half-way between pleural air and lung, and their distance: Otsu's two classes, then their peaks.
+
+    A lung that is still light has a peak not far from air's, and Otsu's level parts it from its own dense tail; then
+    the darker class is parted once more.
+    """
     counts, edges = np.histogram(hu, bins=np.arange(-1030.0, AERATED_HU, 5.0))
     level = (edges[:-1] + edges[1:]) / 2
-    share = counts / max(int(counts.sum()), 1)
-    below = np.cumsum(share)
-    moment = np.cumsum(share * level)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        between = (moment[-1] * below - moment) ** 2 / (below * (1 - below))
-    cut = int(np.nan_to_num(between, posinf=0.0).argmax())
     smooth = ndimage.gaussian_filter1d(counts.astype(float), 2.0)
-    dark, bright = level[: cut + 1], level[cut + 1 :]
+    cut = _otsu(level, counts)
     if not counts[: cut + 1].any() or not counts[cut + 1 :].any():
         return float(level[0]), 0.0
-    air, lung = float(dark[smooth[: cut + 1].argmax()]), float(bright[smooth[cut + 1 :].argmax()])
-    trough = smooth[(level > air) & (level < lung)]
-    if trough.size == 0 or trough.min() > 0.9 * min(smooth[level == air][0], smooth[level == lung][0]):
-        return _beside_one_peak(level, smooth)
-    if lung - air < LEAST_CONTRAST_HU and level[smooth.argmax()] == air:
-        return _beside_one_peak(level, smooth)
-    return (air + lung) / 2, lung - air
+    air, lung, is_parted = _peaks(level, smooth, cut)
+    if is_parted and not (lung - air < LEAST_CONTRAST_HU and level[smooth.argmax()] == air):
+        return (air + lung) / 2, lung - air
+    dark = slice(0, cut + 1)
+    air, lung, is_parted = _peaks(level[dark], smooth[dark], _otsu(level[dark], counts[dark]))
+    if is_parted and lung - air >= LEAST_CONTRAST_HU:
+        return (air + lung) / 2, lung - air
+    return _beside_one_peak(level, counts)
+
+
+def _otsu(level: Array, counts: Array) -> int:
+    """Last of the darker of two classes of levels (n,), by their counts (n,). Ref: Otsu 1979."""
+    share = counts / max(int(counts.sum()), 1)
+    below, moment = np.cumsum(share), np.cumsum(share * level)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        between = (moment[-1] * below - moment) ** 2 / (below * (1 - below))
+    return int(np.nan_to_num(between, posinf=0.0).argmax())
+
+
+def _peaks(level: Array, smooth: Array, cut: int) -> tuple[float, float, bool]:
+    """Level of the highest count (n,) of either class, and whether a trough lies between them."""
+    if len(level) < cut + 2:
+        return float(level[0]), float(level[-1]), False
+    air, lung = int(smooth[: cut + 1].argmax()), cut + 1 + int(smooth[cut + 1 :].argmax())
+    trough = smooth[air + 1 : lung]
+    is_parted = trough.size > 0 and trough.min() <= 0.9 * min(smooth[air], smooth[lung])
+    return float(level[air]), float(level[lung]), bool(is_parted)
 
 
 def _beside_one_peak(level: Array, counts: Array) -> tuple[float, float]:
     """The same where air alone has a peak, since a diseased lung has every density: the peak's dark flank tells how
     wide air is. A lung that is all there has little beside its peak.
+
+    What was clipped at the darkest level is no peak, and a peak beside it lacks its flank.
     """
+    first, counts = int((counts > 0).argmax()), counts.astype(float)
+    if counts[first] > CLIPPED_SHARE * counts.sum():
+        counts[first] = min(counts[first], counts[min(first + 1, len(counts) - 1)])
+    counts = ndimage.gaussian_filter1d(counts, 2.0)
     at = int(counts.argmax())
     air, dark = float(level[at]), counts[: at + 1]
     width = float(np.sqrt(np.average((level[: at + 1] - air) ** 2, weights=dark)))
+    if air - level[first] < CLIPPED_HU:
+        width = max(width, CLIPPED_HU)
     contrast = 2 * AIR_WIDTHS * width
     beyond = float(counts[level > air + contrast].sum() / counts.sum())
     return air + contrast / 2, contrast if beyond > LEAST_BESIDE_AIR else 0.0
