@@ -98,9 +98,7 @@ def _unsound(side: str, scene: Thorax, end: Pressed, lost: int) -> list[str]:
     if (after <= 0).any():
         notes.append(f"{side} lung: {(after <= 0).sum()} of {len(after)} elements are turned inside out at the end.")
     if lost:
-        notes.append(
-            f"{side} lung: no balance at {lost} of the pressures between; states there lie on a line."
-        )
+        notes.append(f"{side} lung: no balance at {lost} of the pressures between; states there lie on a line.")
     return notes
 
 
