@@ -6,6 +6,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import nibabel as nib
 import numpy as np
 import pytest
@@ -14,8 +15,9 @@ from typer.testing import CliRunner
 
 from poro.arrays import Array
 from registration.volume import Mask, Volume
-from vatsloc.breathing.case import read_breath
+from vatsloc.breathing.case import Tumour, read_breath
 from vatsloc.breathing.drr import WATER_PER_MM, radiograph
+from vatsloc.breathing.images import _refuse_outside
 from vatsloc.breathing.lungs import Pair, both_scans
 from vatsloc.breathing.masks import back_seen, lungs_of
 from vatsloc.breathing.motion import IN, OUT, LungMotion, Motion, along
@@ -191,6 +193,10 @@ def test_a_hysteresis_loop_is_closed(person: Path, tmp_path: Path) -> None:
     states = [read_vtu(out / f"motion_{n:03d}.vtu").points_ras for n in range(5)]
     assert_allclose(states[4], states[0], atol=1e-3)
     assert np.abs(states[3] - states[1]).max() > 0.05  # same volume, another way
+    picture = cv2.imdecode(np.frombuffer((out / "arrows.png").read_bytes(), np.uint8), cv2.IMREAD_COLOR)
+    assert picture is not None
+    above_the_scale = picture[:-30].astype(int)
+    assert (np.ptp(above_the_scale, axis=2) > 60).sum() > 200  # arrows, not the breath's end, where nothing has moved
     volumes = [state["volume_ml"] for state in told["states"]]
     assert volumes[2] == pytest.approx(volumes[0] - 500, rel=0.03)
     assert volumes[1] == pytest.approx(volumes[3], rel=0.01)
@@ -220,6 +226,25 @@ def test_points_move_with_the_lung_they_lie_in_and_are_scored_the_way_it_goes(pe
     assert scores is not None
     assert scores["mean"] == pytest.approx(3.0, abs=1e-6)
     assert scores["initial_mean"] == pytest.approx(np.hypot(7.0, 3.0))
+
+
+def test_a_tumour_that_touches_no_lung_is_refused() -> None:
+    from tests.poro.breathing_shapes import pear
+
+    mesh = pear()
+    motion = Motion("surface", OUT, (LungMotion("right", mesh, (mesh.points,)),), (0.0,), None)
+    x, y, z = mesh.points.max(axis=0)
+    with pytest.raises(InputRefused, match="outside of the lungs and its radius is 10 mm"):
+        _refuse_outside(Tumour(centre=(x + 20.0, y, z), radius_mm=10.0), motion)
+    _refuse_outside(Tumour(centre=tuple(mesh.points.mean(axis=0)), radius_mm=10.0), motion)
+
+
+def test_the_farthest_state_is_where_tissue_has_moved_most() -> None:
+    from tests.poro.breathing_shapes import pear
+
+    mesh = pear()
+    states = tuple(mesh.points + rise for rise in (0.0, 3.0, -5.0, 1.0))
+    assert Motion("one-scan", OUT, (LungMotion("right", mesh, states),), (0.0,) * 4, None).farthest == 2
 
 
 @pytest.mark.parametrize("direction", [OUT, IN])

@@ -83,7 +83,7 @@ def breathe_case(
         result |= more
         pictures = frames(motion)
         (partial / "film.webp").write_bytes(animated(pictures))
-        (partial / "arrows.png").write_bytes(as_png(pictures[-1 if motion.end is None else motion.end]))
+        (partial / "arrows.png").write_bytes(as_png(pictures[motion.farthest]))
         if views:
             (partial / "coronal.webp").write_bytes(animated([np.stack([p] * 3, axis=2) for p in views[0].pictures]))
         strips, tables = (
