@@ -38,4 +38,4 @@ def test_images_mend_a_far_guess_that_is_folded() -> None:
     assert np.linalg.norm(guess - mesh.points, axis=1).mean() > FAR_MM
     images = Volume(hu.astype(np.float32), a), Volume(moved.astype(np.float32), a)
     found = by_registration(*images, pair, guess)
-    assert np.linalg.norm(found - truth, axis=1).mean() < 1.0
+    assert np.linalg.norm(found - truth, axis=1).mean() < 0.8

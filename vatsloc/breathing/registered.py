@@ -13,6 +13,7 @@ from poro.breathing.affine import affine_to_points
 from poro.breathing.elastic import acting_at, breathe_out
 from poro.breathing.equilibrium import ConstraintTerms
 from poro.breathing.guide import guide
+from poro.fem import Tissue, extrapolate
 from poro.mesh import TetMesh
 from registration.ffd import FfdSettings, Weights
 from registration.images.resample import resample_mask
@@ -21,10 +22,11 @@ from registration.volume import Volume
 from vatsloc.breathing.case import BreathCase
 from vatsloc.breathing.lungs import Pair
 from vatsloc.breathing.motion import OUT, LungMotion, Motion
-from vatsloc.workflow.pose import continued
 
 FAST = FfdSettings(spacing_mm=8.0, levels=4, voxel_mm=2.0, window_mm=14.0, weights=Weights())
 """Coarser than a run's own settings: a lung in seconds, not minutes."""
+BELIEVED = 100.0
+"""Weight of the registration at every node, as in `extrapolate`; at the pleura as well, which both images show."""
 FAR_MM = 12.0
 """Mean motion by the masks from which on the registration starts there, and not from no motion."""
 
@@ -73,7 +75,8 @@ def as_motion(found: Sequence[Registered] | None) -> Motion | None:
 
 
 def by_registration(inspired: Volume, expired: Volume, pair: Pair, guess: Array) -> Array:
-    """Nodes (n, 3) where the images show them in the expiration; near the pleura the tissue continues elastically.
+    """Nodes (n, 3) where the images show them in the expiration; elastic where the registration would turn tissue
+    inside out.
 
     guess: where the masks alone put them. The registration starts from an affine map fitted to that: the guess itself
     folds here and there outside of the mesh, and what starts folded is never let go.
@@ -86,6 +89,6 @@ def by_registration(inspired: Volume, expired: Volume, pair: Pair, guess: Array)
         FAST,
         affine_to_points(mesh.points, guess) if far else None,
     )
-    points = fit.moving_from_fixed(mesh.points)
-    whole = np.ones(len(points), bool)
-    return mesh.points + continued(mesh, TetMesh(mesh.points, mesh.tets), points, whole, whole).u
+    motion = fit.moving_from_fixed(mesh.points) - mesh.points
+    every = np.arange(len(motion))
+    return mesh.points + extrapolate(mesh, every, motion, Tissue(), np.full(len(motion), BELIEVED)).u
