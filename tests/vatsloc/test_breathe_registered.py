@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
+import pytest
 from scipy import ndimage
 
+import vatsloc.breathing.registered as module
+from poro.arrays import Array
 from poro.breathing.elastic import Lung
+from poro.mesh.tetmesh import signed_volumes
 from registration.volume import Mask, Volume
 from tests.vatsloc.test_breathe import CENTRES, affine, lungs
 from vatsloc.breathing.lungs import Pair, meshed
@@ -39,3 +45,29 @@ def test_images_mend_a_far_guess_that_is_folded() -> None:
     images = Volume(hu.astype(np.float32), a), Volume(moved.astype(np.float32), a)
     found = by_registration(*images, pair, guess)
     assert np.linalg.norm(found - truth, axis=1).mean() < 0.8
+
+
+def test_the_registration_is_believed_up_to_the_pleura_but_where_it_folds(monkeypatch: pytest.MonkeyPatch) -> None:
+    full = Mask(lungs(sides=("right",)), affine())
+    mesh = meshed(full, 14.0)
+    pair = Pair("right", full, full, Lung("right", mesh, mesh), 0.0)
+    wavy = np.array([0.0, 0.0, 5.0])
+
+    def at(x: Array) -> Array:
+        return np.asarray(x + np.sin(x[:, :1] / 12.0) * wavy)
+
+    blank = Volume(np.zeros(full.inside.shape, np.float32), affine())
+    monkeypatch.setattr(module, "register_sliding", lambda *_: SimpleNamespace(moving_from_fixed=at))
+    found = by_registration(blank, blank, pair, mesh.points)
+    assert np.abs(found - at(mesh.points)).max() < 0.3
+    torn = mesh.boundary.nodes[40]
+
+    def folded(x: Array) -> Array:
+        moved = at(x)
+        moved[torn] += 1.5 * (x.mean(axis=0) - x[torn])
+        return moved
+
+    monkeypatch.setattr(module, "register_sliding", lambda *_: SimpleNamespace(moving_from_fixed=folded))
+    assert (signed_volumes(folded(mesh.points), mesh.tets) < 0).any()
+    found = by_registration(blank, blank, pair, mesh.points)
+    assert (signed_volumes(found, mesh.tets) > 0).all()
