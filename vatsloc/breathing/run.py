@@ -87,7 +87,13 @@ def breathe_case(
         if views:
             (partial / "coronal.webp").write_bytes(animated([np.stack([p] * 3, axis=2) for p in views[0].pictures]))
         strips, tables = (
-            [Strip("From the front, arrows from the places in the first scan", pictures), *views],
+            [
+                Strip(
+                    "From the front, arrows from the places in the first scan, coloured by their length in space",
+                    pictures,
+                ),
+                *views,
+            ],
             _tables(result),
         )
         (partial / PAGE).write_text(page(case.name, result, strips, tables), encoding="utf-8")
