@@ -64,23 +64,27 @@ class Cavity:
     offset: Array
     pull: float = 0.0
 
-    def distance(self, points: Array) -> tuple[Array, Array]:
-        """Distance (q,) mm within the wall and its slope (q, 3) at points (q, 3)."""
-        value, slope = np.zeros(len(points)), np.zeros_like(points)
+    def distance(self, points: Array) -> tuple[Array, Array, Array]:
+        """Distance (q,) mm within the wall, its slope (q, 3) and its Hessian (q, 3, 3) 1/mm at points (q, 3)."""
+        value, slope, bend = np.zeros(len(points)), np.zeros_like(points), np.zeros((len(points), 3, 3))
         for share, level in self.level:
             if share > 0:
-                v, g, _ = level.evaluate(points)
-                value, slope = value + share * v, slope + share * g
-        return value, slope
+                v, g, h = level.evaluate(points)
+                value, slope, bend = value + share * v, slope + share * g, bend + share * h
+        return value, slope, bend
 
     def respond(self, points: Array) -> tuple[float, Array, Array]:
-        """Energy, nodal forces (n, 3) and their stiffness (n, 3, 3) at points (n, 3) mm."""
-        value, slope = self.distance(points[self.nodes])
+        """Energy, nodal forces (n, 3) and the convex part of their stiffness (n, 3, 3) at points (n, 3) mm.
+
+        The wall's curvature counts: without it, a node off a bent wall is sent past its place by every step.
+        """
+        value, slope, bend = self.distance(points[self.nodes])
         gap = value - self.offset
         stiffness = self.stiffness * np.where(gap < 0, 1.0, self.pull)
         force, block = np.zeros_like(points), np.zeros((len(points), 3, 3))
         force[self.nodes] = -(stiffness * gap)[:, None] * slope
-        block[self.nodes] = stiffness[:, None, None] * slope[:, :, None] * slope[:, None, :]
+        bent = slope[:, :, None] * slope[:, None, :] + gap[:, None, None] * bend
+        block[self.nodes] = convex(stiffness[:, None, None] * bent)
         return float((stiffness * gap**2).sum() / 2), force, block
 
 

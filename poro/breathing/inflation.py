@@ -16,7 +16,7 @@ from poro.breathing.equilibrium import Scene, convex, energy_of, volume
 from poro.fem.forms import deformation_gradient, eigenstress_load, tangent_stiffness
 from poro.linalg.solver import linear_solver
 
-STEPS = 10
+STEPS = 20
 _HALVINGS = 8
 VOLUME_KPA = 60.0
 """Stiffness of the spring that holds the volume: a pressure of 0.6 kPa leaves one hundredth of it missing."""

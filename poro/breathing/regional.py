@@ -6,7 +6,7 @@ Ref: Fuerst et al. (A Personalized Biomechanical Model for Respiratory Motion Pr
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,28 +22,28 @@ from poro.fem.forms import deformation_gradient, eigenstress_load, tangent_stiff
 from poro.fem.tissue import Tissue
 from poro.linalg.solver import linear_solver
 from poro.mesh import TetMesh, TriSurface, closest_points, stuff
-from poro.mesh.locate import Location, interpolate, locate
+from poro.mesh.locate import locate
 
 LUNG, BODY = Tissue(young_kpa=0.9, poisson=0.4), Tissue(young_kpa=7.8, poisson=0.43)
 """Ref: Fuerst, section 2.2."""
 SHELL_MM, APART_MM = 30.0, 5.0
 """Thickness of the chest about the lung, and the gap between it and the body below the diaphragm."""
-SECTORS, STOREYS, DIAPHRAGM = 4, 3, 2
-"""Patches about the lung and along it, and on the diaphragm: 14 pressures."""
+SECTORS, STOREYS, QUARTERS = 3, 3, 4
+"""Patches about the lung and along it, nine as in the paper, and on the diaphragm: its middle and four quarters about
+it, since it falls farther on one side than on the other. 14 pressures."""
 STICK_KPA_PER_MM = 0.5
 """Sliding contact that neither lets bodies part nor enter each other: it gives way by 1 mm at 0.5 kPa."""
+BEND_MM = 10.0
+"""Least radius of the walls' bend."""
 ANCHOR, FIRM = 0.2, 30.0
 """Stiffness, over the tissue's own, by which chest and body below are held everywhere; back and mediastinum are held
 `FIRM` times as firmly, and so is the body below, sideways."""
-SURFACE_ROUNDS, INNER = 12, 3
-PRIOR_MM_PER_KPA = 0.5
-"""Root mean square distance that a pressure of 1 kPa is held to be worth."""
 TETHER, HILUM_MM = 0.3, 25.0
 """Stiffness, over the tissue's own, by which the hilum is held, and how far that reaches; Fuerst misses it."""
-REACH_MM = 15.0
-"""How far a step of the fit may move any node."""
-STILL_MM = 0.3
-"""Largest motion of a node in a round of contact at which the bodies have settled."""
+ROUNDS = 10
+"""Of contact, at most."""
+STILL_MM, UNSTEADY_MM = 0.05, 0.5
+"""Mean motion of the nodes in a round of contact at which the bodies have settled, and from which on they do not."""
 
 
 @dataclass(frozen=True)
@@ -76,22 +76,19 @@ class Thorax:
 
 @dataclass(frozen=True)
 class Pressed:
-    """Bodies under pressures p (k,) kPa. u: (n, 3) mm; by_pressure: (n, 3, k) mm/kPa."""
+    """Bodies under pressures p (k,) kPa. u: (n, 3) mm; by_pressure: (n, 3, k) mm/kPa; moving_mm: mean motion of the
+    nodes in the last round of contact.
+    """
 
     p: Array
     u: Array
     by_pressure: Array
+    moving_mm: float
 
-
-@dataclass(frozen=True)
-class PressureFit:
-    """Pressures (k,) kPa that bring the lung's border to the target. history: mean surface distance in mm, per round;
-    evaluations: equilibria computed.
-    """
-
-    state: Pressed
-    history: tuple[float, ...]
-    evaluations: int
+    @property
+    def settled(self) -> bool:
+        """Whether the bodies have found their balance."""
+        return self.moving_mm < UNSTEADY_MM
 
 
 EDGE_MM = 22.0
@@ -112,14 +109,17 @@ def thorax(inside: Array, ras_from_ijk: Array, pair: Lung, acting: Breathing) ->
     affine[:3, :3] = ras_from_ijk[:3, :3] * step
     affine[:3, 3] -= affine[:3, :3] @ margin
     spacing = spacing * step
-    near = ndimage.distance_transform_edt(~coarse, sampling=spacing) < SHELL_MM
+    away = ndimage.distance_transform_edt(~coarse, sampling=spacing)
+    near = away < SHELL_MM
+    # A spike of chest in a cleft of the lung, as thin as its mesh is coarse, would swing about under pressure.
+    cleft = ndimage.distance_transform_edt(away < EDGE_MM / 2, sampling=spacing) > EDGE_MM / 2
     towards_feet = (towards > 0) == (ras_from_ijk[2, 2] > 0)
     order = slice(None) if towards_feet else slice(None, None, -1)
     above = np.logical_or.accumulate(coarse[:, :, order], axis=2)[:, :, order]
     last = np.logical_or.accumulate(coarse[:, :, order][:, :, ::-1], axis=2)[:, :, ::-1][:, :, order]
     below = near & above & ~last & ~coarse
     below = _largest(below)
-    chest = near & ~coarse & (ndimage.distance_transform_edt(~below, sampling=spacing) > APART_MM)
+    chest = near & ~coarse & ~cleft & (ndimage.distance_transform_edt(~below, sampling=spacing) > APART_MM)
     bodies = [stuff(chest, affine, EDGE_MM), stuff(below, affine, EDGE_MM)]
     starts = np.cumsum([0, len(lung.points), len(bodies[0].points), len(bodies[1].points)])
     points = np.concatenate([lung.points, *(body.points for body in bodies)])
@@ -136,13 +136,13 @@ def thorax(inside: Array, ras_from_ijk: Array, pair: Lung, acting: Breathing) ->
     return Thorax(mesh, moduli, lung, walls, carried, _patches(walls, is_below, lung), anchors, load)
 
 
-def press(scene: Thorax, p: Array, start: Array, share: float = 1.0, rounds: int = INNER) -> Pressed:
+def press(scene: Thorax, p: Array, start: Array, share: float = 1.0, rounds: int = ROUNDS) -> Pressed:
     """Balance of the bodies under pressures p (k,) kPa from displacements (n, 3) mm, and its derivative by them.
 
     Tissue is linear in a frame that turns with every element; that frame, contact and the pressures' direction follow
     the bodies, round by round. Ref: Mueller & Gross 2004 (corotational elasticity).
     """
-    u, k = start, len(p)
+    u, k, moving = start, len(p), np.inf
     answers = np.zeros((*start.shape, k + 1))
     for _ in range(rounds):
         forces = _patch_forces(scene, u)
@@ -154,9 +154,10 @@ def press(scene: Thorax, p: Array, start: Array, share: float = 1.0, rounds: int
         right = np.concatenate([(known + contact.force + share * scene.load)[:, :, None], forces], axis=2)
         answers = linear_solver(matrix, scene.mesh.points).solve(right.reshape(-1, k + 1)).reshape(answers.shape)
         last, u = u, answers[:, :, 0] + answers[:, :, 1:] @ p
-        if np.abs(u - last).max() < STILL_MM:
+        moving = float(np.linalg.norm(u - last, axis=1).mean())
+        if moving < STILL_MM:
             break
-    return Pressed(p, u, answers[:, :, 1:])
+    return Pressed(p, u, answers[:, :, 1:], moving)
 
 
 def _turned(scene: Thorax, u: Array) -> tuple[Array, Array]:
@@ -176,86 +177,18 @@ def _turned(scene: Thorax, u: Array) -> tuple[Array, Array]:
     return lame[:, None, None, None, None] * pairs + along, turn @ stress
 
 
-def fit_pressures(
-    scene: Thorax,
-    target: TriSurface,
-    matched: tuple[Location, Array, Array] | None = None,
-    say: Callable[[str], None] = lambda _: None,
-) -> PressureFit:
-    """Pressures by a trust region on the distances between the lung's border and the target's, both ways.
-
-    matched: where landmarks lie in the lung (its own node numbers), their places (k, 3) at rest and in the target, for
-    the fit that sees them (E2). Each round costs one equilibrium, whose factor also yields all derivatives.
-    """
-    border = scene.lung.boundary
-    k = scene.patches
-    state = press(scene, np.zeros(k), np.zeros_like(scene.mesh.points))
-    residual, slope, mean = _distances(scene, border, target, state, matched)
-    history, damping, evaluations = [mean], 1e-2, 1
-    best, least, since = state, float(residual @ residual), 0
-    for _ in range(SURFACE_ROUNDS):
-        normal = slope.T @ slope
-        step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)) + 1e-9 * np.eye(k), -slope.T @ residual)
-        motion = state.by_pressure @ step
-        step = step * min(1.0, REACH_MM / max(float(np.linalg.norm(motion, axis=1).max()), 1e-9))
-        before = float(residual @ residual)
-        state = press(scene, state.p + step, state.u + state.by_pressure @ step)
-        evaluations += 1
-        residual, slope, mean = _distances(scene, border, target, state, matched)
-        # The walls slide on as contact follows them, so a round may well be dearer than the one before.
-        damping = damping / 3 if residual @ residual < before else damping * 5
-        if residual @ residual < 0.99 * least:
-            best, least, since = state, float(residual @ residual), 0
-            history.append(mean)
-            say(f"mean surface distance {mean:.2f} mm after {evaluations} equilibria")
-        else:
-            since += 1
-            if since == 3:
-                break
-    state = best
-    return PressureFit(state, tuple(history), evaluations)
-
-
-def _distances(
-    scene: Thorax,
-    border: TriSurface,
-    target: TriSurface,
-    state: Pressed,
-    matched: tuple[Location, Array, Array] | None,
-) -> tuple[Array, Array, float]:
-    """Residuals (q,), their derivatives (q, k) by the pressures, and the mean surface distance in mm."""
-    moved = border.moved(border.points + state.u[border.nodes])
-    there, back = closest_points(target, moved.points), closest_points(moved, target.points)
-    change = state.by_pressure[border.nodes]
-    at_back = np.einsum("qk,qkdp->qdp", back.barycentric, change[border.triangles[back.triangle]])
-    normal = np.concatenate([target.normals[there.triangle], target.node_normals])
-    gap = np.concatenate([moved.points - there.points, back.points - target.points])
-    root = np.sqrt(np.concatenate([moved.node_areas / moved.areas.sum(), target.node_areas / target.areas.sum()]) / 2)
-    along = np.einsum("qd,qd->q", gap, normal)
-    robust = 1 / np.sqrt(1 + (along / 20.0) ** 2)
-    slope = np.einsum("qd,qdp->qp", normal, np.concatenate([change, at_back]))
-    residual, slope = root * robust * along, (root * robust)[:, None] * slope
-    # Patches that the border hardly tells apart would run away against each other.
-    k = len(state.p)
-    residual = np.concatenate([residual, PRIOR_MM_PER_KPA * state.p])
-    slope = np.concatenate([slope, PRIOR_MM_PER_KPA * np.eye(k)])
-    mean = float(np.average(np.abs(there.distance), weights=moved.node_areas))
-    if matched is not None:
-        where, rest, goal = matched
-        off = rest + interpolate(where, state.u[: len(scene.lung.points)]) - goal
-        by = interpolate(where, state.by_pressure[: len(scene.lung.points)])
-        weight = 1 / np.sqrt(len(rest))
-        residual = np.concatenate([residual, weight * off.ravel()])
-        slope = np.concatenate([slope, weight * by.reshape(-1, by.shape[2])])
-    return residual, slope, mean
-
-
 def _contact(scene: Thorax, u: Array) -> ConstraintTerms:
-    """Contact along the walls' normals that keeps the lung's border on the walls, wherever it slid to."""
+    """Contact along the walls' normals that keeps the lung's border on the walls, wherever it slid to.
+
+    Normals are interpolated between the walls' nodes: those of flat triangles turn at once where a node slides over an
+    edge, and it then goes back and forth for ever. What the walls' bend adds to the tangent is bounded from above, as a
+    spring along the walls to where the node is: it slows a round down and changes no balance.
+    """
     border, walls = scene.lung.boundary, scene.moved_walls(u)
     here = border.points + u[border.nodes]
     near = closest_points(walls, here)
-    normal = walls.normals[near.triangle]
+    normal = np.einsum("qk,qkd->qd", near.barycentric, walls.node_normals[walls.triangles[near.triangle]])
+    normal = normal / np.linalg.norm(normal, axis=1)[:, None]
     rows, n = np.arange(len(here)), len(u)
     at_wall = coo_matrix(
         (near.barycentric.ravel(), (np.repeat(rows, 3), walls.triangles[near.triangle].ravel())),
@@ -265,10 +198,11 @@ def _contact(scene: Thorax, u: Array) -> ConstraintTerms:
         coo_matrix((np.ones(len(here)), (rows, border.nodes)), (len(here), n)) - at_wall @ scene.carried
     ).tocsr()
     apart = np.einsum("qd,qd->q", here - near.points, normal)
-    wanted = np.einsum("qd,qd->q", operator @ u, normal) - apart
     area = border.moved(here).node_areas
-    stiffness = STICK_KPA_PER_MM * area[:, None, None] * normal[:, :, None] * normal[:, None, :]
-    return ConstraintTerms(*point_constraints(operator, stiffness, wanted[:, None] * normal))
+    along = normal[:, :, None] * normal[:, None, :]
+    bent = (np.abs(apart) / BEND_MM)[:, None, None] * (np.eye(3) - along)
+    stiffness = STICK_KPA_PER_MM * area[:, None, None] * (along + bent)
+    return ConstraintTerms(*point_constraints(operator, stiffness, operator @ u - apart[:, None] * normal))
 
 
 def _patch_forces(scene: Thorax, u: Array) -> Array:
@@ -296,15 +230,24 @@ def _carried(walls: TriSurface, bodies: Sequence[TetMesh], lung_nodes: int) -> t
 
 
 def _patches(walls: TriSurface, is_below: Array, lung: TetMesh) -> Array:
-    """Patch (t,) of every triangle: sectors and storeys of the chest, front and back of the diaphragm."""
+    """Patch (t,) of every triangle: sectors and storeys of the chest; quarters of the diaphragm about its middle."""
     below = is_below[walls.triangles].sum(axis=1) >= 2
     middle = walls.points[walls.triangles].mean(axis=1)
     centre = np.average(lung.points, axis=0, weights=lung.node_volumes)
-    angle = np.arctan2(middle[:, 1] - centre[1], middle[:, 0] - centre[0])
-    sector = np.floor((angle + np.pi) / (2 * np.pi) * SECTORS).astype(int) % SECTORS
-    height = np.argsort(np.argsort(middle[:, 2])) * STOREYS // len(middle)
-    patch = np.where(below, SECTORS * STOREYS + (middle[:, 1] > centre[1]), sector + SECTORS * height)
+    height = np.zeros(len(middle), int)
+    height[~below] = np.argsort(np.argsort(middle[~below, 2])) * STOREYS // (~below).sum()
+    patch = _sector(middle - centre, SECTORS) + SECTORS * height
+    if below.any():
+        aside = middle - middle[below].mean(axis=0)
+        inner = np.linalg.norm(aside[:, :2] / aside[below, :2].std(axis=0), axis=1) < 1
+        patch = np.where(below, SECTORS * STOREYS + np.where(inner, QUARTERS, _sector(aside, QUARTERS)), patch)
     return np.asarray(np.unique(patch, return_inverse=True)[1])
+
+
+def _sector(offset: Array, count: int) -> Array:
+    """Sector (t,) of offsets (t, 3) by their angle about the body's axis."""
+    angle = np.arctan2(offset[:, 1], offset[:, 0])
+    return np.asarray(np.floor((angle + np.pi) / (2 * np.pi) * count).astype(int) % count)
 
 
 def _anchors(bodies: Sequence[TetMesh], starts: Array, points: Array, pair: Lung, towards: float) -> csr_matrix:

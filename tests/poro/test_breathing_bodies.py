@@ -10,10 +10,12 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from poro.arrays import Array
+from poro.breathing import pressure_fit
 from poro.breathing.body import Body, body, border_motion, network, spring_stiffness
 from poro.breathing.elastic import WALL_ALONE, Lung
 from poro.breathing.mesh_quality import _slopes, quality, smooth, violations
-from poro.breathing.regional import SECTORS, STOREYS, Thorax, _patches, _turned, fit_pressures, press, thorax
+from poro.breathing.pressure_fit import balanced, fit_pressures
+from poro.breathing.regional import QUARTERS, SECTORS, STOREYS, Thorax, _contact, _patches, _turned, press, thorax
 from poro.mesh import TetMesh, stuff
 
 REGULAR = np.array([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
@@ -106,6 +108,75 @@ def test_patches_of_the_chest_are_sectors_of_one_angle_in_storeys_of_one_height(
     assert_array_equal(patch % SECTORS, turn // (360 / SECTORS))
     lowest, highest = (np.array([f(z[patch // SECTORS == k]) for k in range(STOREYS)]) for f in (np.min, np.max))
     assert (lowest[1:] >= highest[:-1]).all()
+
+
+def test_the_diaphragm_has_a_middle_and_four_quarters_about_it() -> None:
+    lung = pear(12.0)
+    walls = lung.boundary
+    is_below = walls.points[:, 2] < -25
+    patch = _patches(walls, is_below, lung)
+    below = is_below[walls.triangles].sum(axis=1) >= 2
+    assert patch.max() + 1 == SECTORS * STOREYS + QUARTERS + 1
+    aside = (walls.points[walls.triangles].mean(axis=1))[below]
+    x, y = (aside - aside.mean(axis=0))[:, :2].T
+    of_diaphragm = patch[below] - SECTORS * STOREYS
+    assert of_diaphragm.min() == 0
+    inner = of_diaphragm == QUARTERS
+    assert np.hypot(x, y)[inner].max() < np.hypot(x, y)[~inner].max()
+    assert_allclose([x[inner].mean(), y[inner].mean()], 0, atol=6)
+    for quarter in range(QUARTERS):
+        here = of_diaphragm == quarter
+        assert len(np.unique(np.sign(x[here]))) == len(np.unique(np.sign(y[here]))) == 1
+    assert (patch[~below] < SECTORS * STOREYS).all()
+
+
+def test_contact_finds_its_balance_round_by_round(chest: tuple[Thorax, Lung]) -> None:
+    """Each round moves the bodies less than the one before; over flat triangles' normals they go on for ever."""
+    scene, _ = chest
+    u, moved = np.zeros_like(scene.mesh.points), []
+    for _ in range(9):
+        found = press(scene, np.full(scene.patches, 1.0), u, rounds=1)
+        moved.append(found.moving_mm)
+        u = found.u
+    assert moved[0] > 1
+    assert moved[-1] < 0.02 * moved[0]
+    assert found.settled
+
+
+def test_contact_changes_nothing_along_the_wall_once_it_is_in_balance(chest: tuple[Thorax, Lung]) -> None:
+    scene, lung = chest
+    still = np.zeros_like(scene.mesh.points)
+    slid = still.copy()
+    nodes, normal = lung.expired.boundary.nodes, lung.expired.boundary.node_normals
+    slid[nodes] = 2.0 * np.cross(normal, [0.0, 0.0, 1.0])
+    contact = _contact(scene, slid)
+    force = contact.force - (contact.matrix @ slid.ravel()).reshape(-1, 3)
+    along = np.linalg.norm(np.cross(force[nodes], scene.walls.node_normals), axis=1).mean()
+    assert along < 0.2 * np.linalg.norm(force[nodes], axis=1).mean() + 1e-6
+
+
+def test_a_fit_that_finds_no_balance_shortens_its_step(
+    chest: tuple[Thorax, Lung], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene, lung = chest
+    steps: list[float] = []
+
+    def never(scene: Thorax, p: Array, start: Array, share: float = 1.0) -> None:
+        steps.append(float(np.abs(p).max()))
+
+    monkeypatch.setattr(pressure_fit, "balanced", never)
+    fit = fit_pressures(scene, lung.inspired.boundary)
+    assert len(steps) == pressure_fit.REFUSALS
+    assert steps[-1] < 0.5 * steps[0]
+    assert_allclose(fit.state.p, 0)
+    assert len(fit.history) == 1
+
+
+def test_pressures_beyond_any_breath_find_no_balance(chest: tuple[Thorax, Lung]) -> None:
+    scene, _ = chest
+    still = np.zeros_like(scene.mesh.points)
+    assert balanced(scene, np.full(scene.patches, 0.2), still) is not None
+    assert balanced(scene, np.full(scene.patches, 60.0), still) is None
 
 
 def test_pressures_pull_lung_and_wall_outward_and_their_derivative_is_what_they_do(chest: tuple[Thorax, Lung]) -> None:

@@ -13,10 +13,11 @@ from poro.breathing import one_scan as module
 from poro.breathing.cavity import TISSUE as TISSUE_OF_LUNG
 from poro.breathing.cavity import inflating
 from poro.breathing.elastic import WALL_ALONE, Lung
-from poro.breathing.equilibrium import Balance, ConstraintTerms, Scene, _tissue, balance, volume
+from poro.breathing.equilibrium import Balance, Cavity, ConstraintTerms, Scene, _tissue, balance, volume
 from poro.breathing.inflation import Filled, _swelling, fill, fill_to
 from poro.breathing.one_scan import _wall, one_scan, regions
 from poro.breathing.pressure_volume import PER_PA, inspired_volume, pressure_volume, recoil_pa
+from poro.contact.levelset import level_set
 from poro.fem import Tissue, neo_hookean
 from poro.mesh import TetMesh
 
@@ -96,6 +97,33 @@ def test_a_lung_fills_its_cavity_and_stays_within() -> None:
     assert recoil[1] > recoil[0] > 0
     top, bottom = expired.points[:, 2] > 40, expired.points[:, 2] < -20
     assert phases[-1].u[top, 2].mean() > 2 > -2 > phases[-1].u[bottom, 2].mean()
+
+
+def test_the_inflation_of_a_lung_settles_step_by_step() -> None:
+    expired, inspired = pear(), pear(stretch=np.array([1.05, 1.1, 1.15]))
+    scene = inflating(Lung("right", inspired, expired), WALL_ALONE)
+    phases = list(fill(scene.at, [0.5, 1.0], scene.volume, scene.guess))
+    assert all(phase.settled for phase in phases)
+    assert max(phase.steps for phase in phases) < 9
+
+
+@pytest.mark.parametrize("off", [6.0, -6.0])
+def test_the_cavity_s_stiffness_is_the_derivative_of_its_force_where_that_is_convex(off: float) -> None:
+    """Nodes of a ball, outside of or within where they touch: the wall's curvature stiffens one and not the other."""
+    mesh = pear()
+    nodes = mesh.boundary.nodes[::7]
+    level = level_set(mesh.boundary, 5.0, 2.5)
+    cavity = Cavity(((1.0, level),), nodes, np.full(len(nodes), 2.0), np.full(len(nodes), off), pull=1.0)
+    block, h = cavity.respond(mesh.points)[2], 1e-4
+    rng = np.random.default_rng(4)
+    way = rng.normal(size=mesh.points.shape)
+    ahead, behind = (cavity.respond(mesh.points + t * way)[1] for t in (h, -h))
+    exact = -((ahead - behind) / (2 * h) * way).sum(axis=1)[nodes]
+    found = np.einsum("ni,nij,nj->n", way, block, way)[nodes]
+    assert (found >= exact - 1e-6).all()
+    assert (found >= -1e-9).all()
+    if off > 0:
+        assert (np.abs(found - exact) < 1e-3).mean() > 0.3
 
 
 def test_the_pressure_volume_curve_runs_both_ways_and_starts_with_its_compliance() -> None:

@@ -53,9 +53,19 @@ def frames(motion: Motion) -> list[Array]:
                 )
         text = f"state {n}: {motion.volume_ml(n):.0f} ml"
         cv2.putText(picture, text, (10, 22), cv2.FONT_HERSHEY_SIMPLEX, 0.55, (230, 230, 230), 1, cv2.LINE_AA)
+        _scale(picture, float(largest))
         cv2.putText(picture, "R", (8, HEIGHT // 2), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (230, 230, 230), 1, cv2.LINE_AA)
         pictures.append(picture)
     return pictures
+
+
+def _scale(picture: Array, largest_mm: float) -> None:
+    """Colours of the arrows by their length, drawn along the lower edge."""
+    left, width = 40, picture.shape[1] - 110
+    ramp = cv2.applyColorMap(np.arange(256, dtype=np.uint8)[None], cv2.COLORMAP_TURBO)
+    picture[HEIGHT - 18 : HEIGHT - 10, left : left + width] = cv2.resize(ramp, (width, 8))
+    for text, x in (("0", left - 16), (f"{largest_mm:.0f} mm", left + width + 6)):
+        cv2.putText(picture, text, (x, HEIGHT - 9), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (230, 230, 230), 1, cv2.LINE_AA)
 
 
 WINDOW_HU = (-1000.0, 300.0)

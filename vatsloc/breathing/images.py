@@ -14,7 +14,7 @@ from scipy import ndimage
 
 from poro.arrays import Array
 from poro.breathing.body import Body, body, border_motion, network
-from poro.mesh import TetMesh, stuff
+from poro.mesh import TetMesh, locate, stuff
 from poro.mesh.tetmesh import signed_volumes
 from registration.images.interpolate import interpolate
 from registration.images.resample import coarsen, resample
@@ -26,7 +26,7 @@ from vatsloc.breathing.drr import VIEWS, Radiograph, radiograph
 from vatsloc.breathing.film import as_png, slice_of
 from vatsloc.breathing.motion import OUT, Motion
 from vatsloc.breathing.page import Strip
-from vatsloc.errors import VatslocError
+from vatsloc.errors import InputRefused, VatslocError
 from vatsloc.formats.fields import write_field
 from vatsloc.formats.nifti import write_volume
 from vatsloc.frames import flip_points, reorient
@@ -67,6 +67,7 @@ def write_images(
     hu, affine = reorient(scan.image.hu, scan.image.ras_from_ijk, "RAS")
     ct = Volume(np.ascontiguousarray(hu), affine)
     if case.tumour is not None:
+        _refuse_outside(case.tumour, motion)
         ct = _with_tumour(ct, case.tumour)
     say("the rest of the body follows ...")
     followed = follow(ct, motion)
@@ -212,6 +213,17 @@ def _spine(ct: Volume, mesh: TetMesh) -> Array:
     away = ndimage.distance_transform_edt(~mask.inside, sampling=mask.grid.spacing).astype(np.float32)
     near = interpolate(np.ascontiguousarray(away), mask.grid, mesh.points, 1e3) < 8.0
     return np.asarray(near if near.sum() > 3 else mesh.points[:, 1] < np.quantile(mesh.points[:, 1], 0.1))
+
+
+def _refuse_outside(tumour: Tumour, motion: Motion) -> None:
+    """Raises InputRefused where a tumour touches no lung."""
+    centre = np.array([tumour.centre])
+    away = min(float(locate(lung.mesh, centre).distance[0]) for lung in motion.lungs)
+    if away > tumour.radius_mm:
+        raise InputRefused(
+            f"The tumour's centre lies {away:.0f} mm outside of the lungs and its radius is {tumour.radius_mm:.0f} mm; "
+            "correct centre in [tumour], RAS mm."
+        )
 
 
 def _with_tumour(ct: Volume, tumour: Tumour) -> Volume:

@@ -10,7 +10,7 @@ from poro.breathing.elastic import Lung, depth_of
 from poro.mesh import TetMesh, stuff
 from registration.volume import Mask
 from vatsloc.breathing.case import BreathCase, Scan
-from vatsloc.breathing.masks import CleanLungs, lungs_of, to_the_back
+from vatsloc.breathing.masks import BACK_MM, BACK_SEEN, CleanLungs, back_seen, lungs_of, to_the_back
 from vatsloc.errors import InputRefused
 from vatsloc.frames import Side
 from vatsloc.imaging.lattice import on_grid
@@ -55,8 +55,11 @@ def both_scans(case: BreathCase, edge_mm: float = EDGE_MM) -> tuple[list[Pair], 
     for side in sides:
         full, rest = inspired.lungs[side], expired.lungs[side]
         ratio = _mm3(full) / _mm3(rest)
+        seen, shown = float(back_seen(rest, full).min()), rest
         if case.expiration.image is None:
             rest = to_the_back(rest, full)
+        if seen < BACK_SEEN:
+            notes.append(_lacking(side, seen, (_mm3(rest) - _mm3(shown)) / 1000))
         if not 1 / MUCH < ratio < MUCH * 1.5:
             raise InputRefused(
                 f"The {side} lung is {ratio:.2f} times as large in the inspiration as in the expiration, which no "
@@ -76,6 +79,18 @@ def masks_of(scan: Scan) -> CleanLungs:
     work, _, halves, _ = lung_halves(scan.image)
     both = np.logical_or.reduce(list(halves.values()))
     return lungs_of(on_grid(both, work.grid, work.grid), scan.name)
+
+
+def _lacking(side: Side, seen: float, filled_ml: float) -> str:
+    """Warning of an expired lung without its back."""
+    filled = (
+        f"{filled_ml:.0f} ml were filled in up to the inspired back wall, and" if filled_ml else "It was left so, and"
+    )
+    return (
+        f"The expired {side} lung lacks its back: somewhere along the body its mask holds {100 * seen:.0f} % of the "
+        f"{BACK_MM:.0f} mm in front of the inspired back wall, at least {100 * BACK_SEEN:.0f} % are usual. "
+        f"{filled} motion behind and near it is a guess; look at the mask."
+    )
 
 
 def _mm3(lung: Mask) -> float:

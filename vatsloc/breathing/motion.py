@@ -51,6 +51,15 @@ class Motion:
         """Number of states."""
         return len(self.lungs[0].states)
 
+    @property
+    def farthest(self) -> int:
+        """State in which tissue is farthest from where the motion starts, in mean."""
+        far = [
+            np.mean([np.linalg.norm(lung.states[n] - lung.mesh.points, axis=1).mean() for lung in self.lungs])
+            for n in range(self.count)
+        ]
+        return int(np.argmax(far))
+
     def volume_ml(self, state: int) -> float:
         """Volume of all lungs in a state."""
         return sum(lung.volume_ml(state) for lung in self.lungs)

@@ -7,14 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from poro.arrays import Array
 from poro.breathing.elastic import acting_at
-from poro.breathing.regional import Thorax, fit_pressures, press, thorax
+from poro.breathing.pressure_fit import balanced, fit_pressures
+from poro.breathing.regional import Pressed, Thorax, thorax
 from poro.mesh import locate
 from poro.mesh.locate import Location
 from poro.mesh.tetmesh import signed_volumes
@@ -45,7 +45,8 @@ def drive(case: BreathCase, count: int, say: Callable[[str], None], see_landmark
             matched = locate(pair.lung.expired, known.expired), known.expired, known.inspired.points
         fit = fit_pressures(scene, pair.lung.inspired.boundary, matched, partial(_say, say, pair.side))
         say(f"{pair.side} lung: {count - 1} states of the fitted pressures ...")
-        states = states_of(scene, fit.state.p, fit.state.u, count)
+        states, lost = states_of(scene, fit.state.p, fit.state.u, count)
+        notes += _unsound(pair.side, scene, fit.state, lost)
         lungs.append(LungMotion(pair.side, scene.lung, states))
         pressures.append(1000 * np.abs(fit.state.p).mean())
         rows.append([pair.side, f"{fit.history[0]:.2f}", f"{fit.history[-1]:.2f}", str(fit.evaluations)])
@@ -65,23 +66,40 @@ def _say(say: Callable[[str], None], side: str, text: str) -> None:
     say(f"{side} lung: {text}")
 
 
-def states_of(scene: Thorax, p: Array, end: Array, count: int) -> tuple[Array, ...]:
-    """Lung's nodes in `count` states from rest to `end`, equal steps of volume apart: the pressures rise together."""
+def states_of(scene: Thorax, p: Array, end: Array, count: int) -> tuple[tuple[Array, ...], int]:
+    """Lung's nodes in `count` states from rest to `end`, equal steps of volume apart, as the pressures rise together;
+    and at how many of the shares of them that were tried the bodies found no balance, where states lie on a line.
+    """
     size = len(scene.lung.points)
-    progress = np.linspace(0.0, 1.0, max(min(count, 6), 2))
-    found, u = [np.zeros_like(end)], np.zeros_like(end)
-    for before, share in pairwise(progress[:-1]):
-        u = press(scene, share * p, u + (share - before) * end, share).u
-        found.append(u)
+    tried = np.linspace(0.0, 1.0, max(min(count, 6), 2))
+    shares_, found, u = [0.0], [np.zeros_like(end)], np.zeros_like(end)
+    for share in tried[1:-1]:
+        pressed = balanced(scene, share * p, u + (share - shares_[-1]) * end, share)
+        if pressed is not None:
+            u = pressed.u
+            shares_.append(float(share))
+            found.append(u)
+    shares_.append(1.0)
     found.append(end)
     volume = np.array([signed_volumes(scene.lung.points + f[:size], scene.lung.tets).sum() for f in found])
     wanted = np.linspace(volume[0], volume[-1], count)
-    order = np.argsort(volume)
+    order, progress = np.argsort(volume), np.array(shares_)
     at = np.interp(wanted, volume[order], progress[order])
     every = np.stack([f[:size] for f in found])
     states = [scene.lung.points + between(every, progress, share) for share in at]
     states[0], states[-1] = scene.lung.points, scene.lung.points + every[-1]
-    return tuple(states)
+    return tuple(states), len(tried) - len(found)
+
+
+def _unsound(side: str, scene: Thorax, end: Pressed, lost: int) -> list[str]:
+    """Sentences on what of a lung's answer is not to be relied on."""
+    notes = []
+    after = signed_volumes(scene.lung.points + end.u[: len(scene.lung.points)], scene.lung.tets)
+    if (after <= 0).any():
+        notes.append(f"{side} lung: {(after <= 0).sum()} of {len(after)} elements are turned inside out at the end.")
+    if lost:
+        notes.append(f"{side} lung: no balance at {lost} of the pressures between; states there lie on a line.")
+    return notes
 
 
 def _matched(case: BreathCase, pair: Pair) -> tuple[Location, Array, Array] | None:

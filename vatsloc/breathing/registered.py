@@ -9,23 +9,24 @@ from dataclasses import dataclass
 import numpy as np
 
 from poro.arrays import Array
+from poro.breathing.affine import affine_to_points
 from poro.breathing.elastic import acting_at, breathe_out
 from poro.breathing.equilibrium import ConstraintTerms
 from poro.breathing.guide import guide
+from poro.fem import Tissue, extrapolate
 from poro.mesh import TetMesh
 from registration.ffd import FfdSettings, Weights
 from registration.images.resample import resample_mask
-from registration.maps.rigid import RigidTransform
 from registration.sliding import LungImage, register_sliding
 from registration.volume import Volume
 from vatsloc.breathing.case import BreathCase
 from vatsloc.breathing.lungs import Pair
 from vatsloc.breathing.motion import OUT, LungMotion, Motion
-from vatsloc.maps import MeshMap
-from vatsloc.workflow.pose import continued
 
 FAST = FfdSettings(spacing_mm=8.0, levels=4, voxel_mm=2.0, window_mm=14.0, weights=Weights())
 """Coarser than a run's own settings: a lung in seconds, not minutes."""
+BELIEVED = 100.0
+"""Weight of the registration at every node, as in `extrapolate`; at the pleura as well, which both images show."""
 FAR_MM = 12.0
 """Mean motion by the masks from which on the registration starts there, and not from no motion."""
 
@@ -74,9 +75,11 @@ def as_motion(found: Sequence[Registered] | None) -> Motion | None:
 
 
 def by_registration(inspired: Volume, expired: Volume, pair: Pair, guess: Array) -> Array:
-    """Nodes (n, 3) where the images show them in the expiration; near the pleura the tissue continues elastically.
+    """Nodes (n, 3) where the images show them in the expiration; elastic where the registration would turn tissue
+    inside out.
 
-    guess: where the masks alone put them.
+    guess: where the masks alone put them. The registration starts from an affine map fitted to that: the guess itself
+    folds here and there outside of the mesh, and what starts folded is never let go.
     """
     mesh = pair.lung.inspired
     far = float(np.linalg.norm(guess - mesh.points, axis=1).mean()) > FAR_MM
@@ -84,8 +87,8 @@ def by_registration(inspired: Volume, expired: Volume, pair: Pair, guess: Array)
         LungImage(inspired, resample_mask(pair.inspired, inspired.grid)),
         LungImage(expired, resample_mask(pair.expired, expired.grid)),
         FAST,
-        MeshMap(mesh, guess, RigidTransform.identity()) if far else None,
+        affine_to_points(mesh.points, guess) if far else None,
     )
-    points = fit.moving_from_fixed(mesh.points)
-    whole = np.ones(len(points), bool)
-    return mesh.points + continued(mesh, TetMesh(mesh.points, mesh.tets), points, whole, whole).u
+    motion = fit.moving_from_fixed(mesh.points) - mesh.points
+    every = np.arange(len(motion))
+    return mesh.points + extrapolate(mesh, every, motion, Tissue(), np.full(len(motion), BELIEVED)).u

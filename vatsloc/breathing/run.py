@@ -37,6 +37,7 @@ DRIVERS: Mapping[str, Drive] = {
 }
 """How a breath is driven, by the name on the command line: one room's module per paper."""
 RESULT, PAGE = "breath.json", "breath.html"
+ARROWS = "From the front, arrows from the places in the first scan, coloured by their length in space"
 STATES = (2, 200)
 WAY = 11
 """States of the way between two scans, when a breath goes there and back along it."""
@@ -83,14 +84,11 @@ def breathe_case(
         result |= more
         pictures = frames(motion)
         (partial / "film.webp").write_bytes(animated(pictures))
-        (partial / "arrows.png").write_bytes(as_png(pictures[-1 if motion.end is None else motion.end]))
+        (partial / "arrows.png").write_bytes(as_png(pictures[motion.farthest]))
         if views:
             (partial / "coronal.webp").write_bytes(animated([np.stack([p] * 3, axis=2) for p in views[0].pictures]))
-        strips, tables = (
-            [Strip("From the front, arrows from the places in the first scan", pictures), *views],
-            _tables(result),
-        )
-        (partial / PAGE).write_text(page(case.name, result, strips, tables), encoding="utf-8")
+        strips = [Strip(ARROWS, pictures), *views]
+        (partial / PAGE).write_text(page(case.name, result, strips, _tables(result)), encoding="utf-8")
         (partial / RESULT).write_text(json.dumps(result, indent=1, allow_nan=False) + "\n", encoding="utf-8")
     return result
 
