@@ -157,7 +157,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "residual": {"grid_mm": 10.0, "voxel_mm": 1.5},
         "refinement": {"cell_mm": 3.5},
     },
-    "auto": {"leave_out": {"first_registration_mm": 10.0, "residual_mm": 0.8}},
+    "auto": {"leave_out": {"first_registration_mm": 10.0, "residual_mm": 2.5}},
 }
 
 

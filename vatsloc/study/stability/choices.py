@@ -17,7 +17,8 @@ from vatsloc.study.tables import markdown
 from vatsloc.workflow.choices import Choice
 from vatsloc.workflow.model_selection import STRAIN
 from vatsloc.workflow.observe import Observed, observe
-from vatsloc.workflow.pneumothorax import RESIDUAL, Collapse, collapse
+from vatsloc.workflow.parted import in_pieces
+from vatsloc.workflow.pneumothorax import RESIDUAL, Collapse, collapse, refined
 from vatsloc.workflow.pose import FIRST, ChangeOfPose, change_of_pose
 from vatsloc.workflow.prepare import Prepared, prepare
 from vatsloc.workflow.settings import settings_of
@@ -50,26 +51,33 @@ class _Scene:
     over: Mapping[str, Any]
 
     def run(self, limits: Mapping[str, float], pose: ChangeOfPose | None, seen: Observed | None) -> _Run:
-        """Both phases of `auto` under other limits; pose, seen: where they are those of another run."""
+        """Both phases of `auto` under other limits, with pieces and blocks; pose, seen: where they are those of another
+        run.
+        """
         settings, stages = settings_of("auto", self.over, {"leave_out": limits}), Stages()
         pose = pose or change_of_pose(self.case, self.prepared, settings, stages)
         seen = seen or observe(self.case, self.prepared, pose, settings, stages)
         found = collapse(self.case, self.prepared, pose, seen, settings, stages)
-        return _Run(self.case, pose, seen, found, tuple(stages.choices))
+        cut, found = in_pieces(self.prepared, pose, found, settings, stages)
+        found = refined(self.case, self.prepared, cut, found, settings, stages)
+        return _Run(self.case, pose, seen, cut, found, tuple(stages.choices))
 
 
 @dataclass(frozen=True)
 class _Run:
+    """pose, cut: the change of pose on the whole lung's mesh, and on that of its pieces."""
+
     case: Case
     pose: ChangeOfPose
     seen: Observed
+    cut: ChangeOfPose
     found: Collapse
     choices: tuple[Choice, ...]
 
     @property
     def nodule(self) -> Array:
         """(3,) RAS mm in the deflated CBCT."""
-        maps = run_maps(self.pose, self.found)
+        maps = run_maps(self.cut, self.found)
         return np.asarray(maps.def_from_ct(self.case.nodule.centre_ras[None])[0])
 
 
