@@ -30,6 +30,7 @@ from vatsloc.study.chart.draw import MARK, NUMBER, interactive, places, require_
 from vatsloc.study.chart.points import dominating, points_of, told_of_presets
 from vatsloc.study.chart.tables import page
 from vatsloc.study.chart.variants import VARIANTS, chosen_variants, masked_only, plain
+from vatsloc.study.cohort import scored
 from vatsloc.workflow.choices import weigh
 from vatsloc.workflow.stages import Stages
 
@@ -152,7 +153,7 @@ def test_a_case_s_rows_hold_the_errors_and_the_seconds_of_what_each_variant_need
 
     def read(stages: Stages) -> Any:
         took(stages, read=1.0, lungs=2.0)
-        return SimpleNamespace()
+        return SimpleNamespace(lung_ct=SimpleNamespace(inside=None, ras_from_ijk=None))
 
     def pose(_case: Any, _prepared: Any, settings: Any, stages: Stages, _register: Any) -> Any:
         took(stages, spine_CT_to_inflated=0.5, rest=3.5)
@@ -193,7 +194,8 @@ def test_a_case_s_rows_hold_the_errors_and_the_seconds_of_what_each_variant_need
     monkeypatch.setattr(chart, "read_case", lambda _folder: SimpleNamespace(nodule=nodule, gravity_ras=None))
     monkeypatch.setattr(chart, "read_truth", lambda _folder: truth)
     monkeypatch.setattr(chart, "prepare", lambda _case, stages: read(stages))
-    monkeypatch.setattr(chart, "_depth", lambda _prepared, _truth: np.array([4.0, 14.0]))
+    monkeypatch.setattr(scored, "stuff", lambda *_mesh: None)
+    monkeypatch.setattr(scored, "depth_below_pleura", lambda _mesh, points: np.array([4.0, 14.0])[: len(points)])
     monkeypatch.setattr(chart, "change_of_pose", pose)
     for step in (observe, modelled, refined):
         monkeypatch.setattr(chart, step.__name__, step)

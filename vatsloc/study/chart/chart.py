@@ -12,15 +12,14 @@ from typing import Any
 import numpy as np
 
 from poro.fit import FitStatus
-from poro.mesh import stuff
 from registration.volume import Array
 from vatsloc.case import Case, read_case
 from vatsloc.errors import InputRefused, NotConverged, VatslocError
-from vatsloc.evaluation.inputs import Truth, depth_below_pleura, read_truth, seen_in
-from vatsloc.evaluation.statistics import distances, summarize
+from vatsloc.evaluation.inputs import Truth, read_truth
+from vatsloc.evaluation.statistics import summarize
 from vatsloc.evaluation.tre import RunMaps, target_registration_errors
 from vatsloc.study.chart.variants import Scored, Variant
-from vatsloc.study.cohort.scored import run_maps
+from vatsloc.study.cohort.scored import Tissue, run_maps
 from vatsloc.workflow.observe import observe
 from vatsloc.workflow.parted import in_pieces
 from vatsloc.workflow.pneumothorax import Collapse, modelled, pneumothorax, refined
@@ -33,8 +32,6 @@ RUNS = "runs.csv"
 PHASES = ("phase1", "phase2", "chain")
 PLEURA_MM = 10.0
 """Tissue nearer to the pleura than this has a panel of its own: most nodules that need localizing lie there."""
-DEPTH_EDGE_MM = 8.0
-"""Tetrahedra of the lung that depths are taken from, as those of a run."""
 SPINES = {"phase1": "spine CT to inflated", "phase2": "spine inflated to deflated"}
 NAN = float("nan")
 
@@ -125,13 +122,12 @@ class _Cost:
 
 @dataclass
 class _CaseRuns:
-    """A case whose images are read and prepared once; what that took counts for every variant's chain. depth_mm: (n,)
-    of the dense truth's points below the pleura."""
+    """A case whose images are read and prepared once; what that took counts for every variant's chain."""
 
     case: Case
     truth: Truth
     prepared: Prepared
-    depth_mm: Array
+    tissue: Tissue
     cost: _Cost
     poses: dict[str, tuple[ChangeOfPose, Stages]] = field(default_factory=dict)
 
@@ -153,7 +149,7 @@ def measure_case(folder: Path, variants: Mapping[str, Variant]) -> Iterator[Row]
     with stages.stage("read"):
         case = read_case(folder)
     prepared, truth = prepare(case, stages), read_truth(folder)
-    runs = _CaseRuns(case, truth, prepared, _depth(prepared, truth), _Cost.of(stages))
+    runs = _CaseRuns(case, truth, prepared, Tissue.of(prepared, truth), _Cost.of(stages))
     for name, variant in variants.items():
         row = Row(name, folder.resolve().name)
         try:
@@ -161,14 +157,6 @@ def measure_case(folder: Path, variants: Mapping[str, Variant]) -> Iterator[Row]
         except (VatslocError, ImportError) as error:
             row = replace(row, failed=str(error).split("\n")[0])
         yield replace(row, load=os.getloadavg()[0])
-
-
-def _depth(prepared: Prepared, truth: Truth) -> Array:
-    """Depth (n,) mm of the dense truth's points below the pleura, the same for every variant."""
-    if truth.dense is None:
-        return np.zeros(0)
-    lung = prepared.lung_ct
-    return depth_below_pleura(stuff(lung.inside, lung.ras_from_ijk, DEPTH_EDGE_MM), truth.dense[:, 0])
 
 
 def _run(runs: _CaseRuns, variant: Variant, row: Row) -> Row:
@@ -215,21 +203,16 @@ def _spines(runs: _CaseRuns, variant: Variant, row: Row) -> Row:
 def _told(runs: _CaseRuns, maps: RunMaps, row: Row, phase1: _Cost, phase2: _Cost) -> Row:
     """The row with errors at landmarks, tissue and nodule, and what both phases took."""
     nodule = maps.def_from_ct(runs.case.nodule.centre_ras[None])
-    row = replace(row, nodule_mm=_off(nodule, runs.truth), **_tissue(runs, maps))
+    row = replace(row, nodule_mm=_off(nodule, runs.truth), **_tissue(runs.tissue, maps))
     row = replace(row, **phase1.named("phase1"), **phase2.named("phase2"))
     return _scored(runs.truth, maps, replace(row, **(runs.cost + phase1 + phase2).named("chain")), PHASES)
 
 
-def _tissue(runs: _CaseRuns, maps: RunMaps) -> dict[str, Any]:
+def _tissue(tissue: Tissue, maps: RunMaps) -> dict[str, Any]:
     """Errors of the chain at tissue that both cone-beam CTs show; empty without dense truth."""
-    truth = runs.truth
-    if truth.dense is None:
+    if len(tissue.ct) == 0:
         return {}
-    ct, places = truth.dense[:, 0], {"inflated": truth.dense[:, 1], "deflated": truth.dense[:, 2]}
-    seen = np.logical_and.reduce([seen_in(field, places[image]) for image, field in truth.fields_of_view.items()])
-    errors = distances(maps.def_from_ct(ct), places["deflated"])
-    near = seen & (runs.depth_mm < PLEURA_MM)
-    found = {"tissue": summarize(errors[seen]), "pleura": summarize(errors[near])}
+    found = {"tissue": tissue.errors(maps), "pleura": tissue.errors(maps, to_mm=PLEURA_MM)}
     return {f"{name}_{what}": getattr(s, what) for name, s in found.items() for what in ("mean", "p95")}
 
 

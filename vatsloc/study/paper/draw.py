@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from vatsloc.evaluation.evaluate import DENSE_DEPTHS_MM
 from vatsloc.evaluation.statistics import signed_rank_p
 from vatsloc.study.paper.paper import BEFORE, COMPLETE, KINDS, STILL, VARIANTS, CaseRuns, Run
 from vatsloc.study.tables import Row, markdown
@@ -34,6 +36,8 @@ def page(results: Sequence[CaseRuns]) -> str:
     parts = [
         "## Errors of the whole chain at the landmarks, mean ± standard deviation; of the nodule, mm",
         markdown([_errors(case) for case in results]),
+        "## Tissue in view by depth below the pleura, whole chain of variant C, mean / 95 %, mm",
+        markdown([_tissue(case) for case in results]),
         "## Two-sided p of Wilcoxon's signed-rank test, case by case; the smaller mean in brackets",
     ]
     for kind in KINDS:
@@ -100,6 +104,18 @@ def _errors(case: CaseRuns) -> Row:
         row |= {f"{kind}, {variant}": _spread(case.run(kind, variant)) for variant in VARIANTS}
         complete = case.run(kind, COMPLETE)
         row[f"{kind}, nodule"] = "" if complete is None or complete.nodule_mm is None else f"{complete.nodule_mm:.2f}"
+    return row
+
+
+def _tissue(case: CaseRuns) -> Row:
+    row: Row = {"case": case.case}
+    for kind in KINDS:
+        complete = case.run(kind, COMPLETE)
+        found = () if complete is None else complete.tissue_mm
+        for number, (from_mm, to_mm) in enumerate(pairwise(DENSE_DEPTHS_MM)):
+            depth = f"{from_mm:g} to {to_mm:g} mm" if np.isfinite(to_mm) else f"{from_mm:g} mm and deeper"
+            known = [mm for mm in found[number] if mm is not None] if number < len(found) else []
+            row[f"{kind}, {depth}"] = " / ".join(f"{mm:.2f}" for mm in known)
     return row
 
 

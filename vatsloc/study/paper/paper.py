@@ -9,6 +9,7 @@ import json
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
+from itertools import pairwise
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -18,12 +19,14 @@ import numpy as np
 from poro.fit import FitStatus
 from vatsloc.case import Case, read_case
 from vatsloc.errors import VatslocError
+from vatsloc.evaluation.evaluate import DENSE_DEPTHS_MM
 from vatsloc.evaluation.inputs import Truth, read_truth
-from vatsloc.evaluation.tre import target_registration_errors
+from vatsloc.evaluation.tre import RunMaps, target_registration_errors
 from vatsloc.formats.folder import write_whole
-from vatsloc.study.cohort.scored import run_maps
+from vatsloc.study.cohort.scored import Tissue, run_maps
 from vatsloc.workflow.observe import Observed, observe
-from vatsloc.workflow.pneumothorax import collapse
+from vatsloc.workflow.parted import in_pieces
+from vatsloc.workflow.pneumothorax import collapse, refined
 from vatsloc.workflow.pose import ChangeOfPose, change_of_pose
 from vatsloc.workflow.prepare import Prepared, prepare
 from vatsloc.workflow.settings import Settings, settings_of
@@ -40,7 +43,12 @@ VARIANTS: dict[str, dict[str, Any]] = {
 """Settings of the paper's variants: no change of pose, no hilum deformation, complete; and complete without
 diaphragm."""
 
-_PAPERS_MODEL = {"model": {"cost": "plain"}, "keypoints": {"on": False}, "residual": {"on": False}}
+_PAPERS_MODEL = {
+    "model": {"cost": "plain"},
+    "keypoints": {"on": False},
+    "residual": {"on": False},
+    "refinement": {"on": False},
+}
 KINDS: dict[str, dict[str, Any]] = {"paper's model": _PAPERS_MODEL, "vatsloc": {}}
 """Both ways that every variant is run: fitted to the surface alone as in the paper, and with all that came after."""
 
@@ -48,7 +56,8 @@ KINDS: dict[str, dict[str, Any]] = {"paper's model": _PAPERS_MODEL, "vatsloc": {
 @dataclass(frozen=True)
 class Run:
     """One variant of one kind on one case. errors_mm: at the landmarks, None where one has no truth; theta: kappa_b in
-    1/(Pa s), phi, d_diaph in mm; failed: why there is no answer.
+    1/(Pa s), phi, d_diaph in mm; failed: why there is no answer; tissue_mm: (mean, 95 %) of the tissue in view in each
+    class of depth between DENSE_DEPTHS_MM, None where there is none, nothing without dense truth.
     """
 
     kind: str
@@ -57,6 +66,7 @@ class Run:
     nodule_mm: float | None = None
     theta: tuple[float, ...] = ()
     failed: str = ""
+    tissue_mm: tuple[tuple[float | None, ...], ...] = ()
 
     @property
     def errors(self) -> np.ndarray:
@@ -97,8 +107,7 @@ def run_paper(cases: Sequence[Path], out: Path, jobs: int = 1, say: Say = quiet)
 def read_runs(file: Path) -> CaseRuns:
     """What `run_paper` wrote of one case."""
     known = json.loads(file.read_text(encoding="utf-8"))
-    rows = (_run({k: tuple(v) if isinstance(v, list) else v for k, v in run.items()}) for run in known["runs"])
-    return CaseRuns(known["case"], tuple(rows))
+    return CaseRuns(known["case"], tuple(Run(**{k: _frozen(v) for k, v in run.items()}) for run in known["runs"]))
 
 
 def measure_case(folder: Path) -> CaseRuns:
@@ -111,6 +120,7 @@ def measure_case(folder: Path) -> CaseRuns:
     except VatslocError as error:
         refused = tuple(Run(kind, variant, failed=str(error)) for variant in VARIANTS for kind in KINDS)
         return CaseRuns(folder.resolve().name, refused)
+    tissue = Tissue.of(prepared, truth)
     poses: dict[bool, ChangeOfPose] = {}
     seen: dict[tuple[bool, bool], Observed] = {}
     runs: list[Run] = []
@@ -122,22 +132,39 @@ def measure_case(folder: Path) -> CaseRuns:
                 poses[moves] = change_of_pose(case, prepared, chosen, Stages())
             if (moves, hilum) not in seen:
                 seen[moves, hilum] = observe(case, prepared, poses[moves], chosen, Stages())
-            runs += _collapses(case, truth, prepared, poses[moves], seen[moves, hilum], variant)
+            scene = _Scene(case, truth, tissue, prepared, poses[moves], seen[moves, hilum])
+            runs += _collapses(scene, variant)
         except VatslocError as error:
             runs += [Run(kind, variant, failed=str(error)) for kind in KINDS]
     return CaseRuns(folder.resolve().name, tuple(dict.fromkeys(runs)))
 
 
-def _collapses(
-    case: Case, truth: Truth, prepared: Prepared, pose: ChangeOfPose, observed: Observed, variant: str
-) -> list[Run]:
-    """A variant in both kinds, and the poses before it if it is the complete one."""
-    runs = []
+@dataclass(frozen=True)
+class _Scene:
+    """A case up to what was observed."""
+
+    case: Case
+    truth: Truth
+    tissue: Tissue
+    prepared: Prepared
+    pose: ChangeOfPose
+    observed: Observed
+
+
+def _collapses(scene: _Scene, variant: str) -> list[Run]:
+    """A variant in both kinds, and the poses before it if it is the complete one. Pieces and blocks follow as in a run,
+    but not in the paper's model.
+    """
+    runs, case, truth, prepared = [], scene.case, scene.truth, scene.prepared
     for kind in KINDS:
-        found = collapse(case, prepared, pose, observed, settings_for(variant, kind), Stages())
+        settings, pose = settings_for(variant, kind), scene.pose
+        found = collapse(case, prepared, pose, scene.observed, settings, Stages())
         if found.fit.status is FitStatus.CONTACT:
             runs.append(Run(kind, variant, failed="the contact did not settle"))
             continue
+        if settings.refinement.on:
+            pose, found = in_pieces(prepared, pose, found, settings, Stages())
+            found = refined(case, prepared, pose, found, settings, Stages())
         maps = run_maps(pose, found)
         errors = target_registration_errors(truth.landmarks, maps).mm
         true = truth.nodule.nodule_deflated_ras
@@ -145,7 +172,7 @@ def _collapses(
         off = None if true is None else float(np.linalg.norm(maps.def_from_inf(maps.inf_from_ct(start))[0] - true))
         theta = found.fit.theta
         known = (theta.kappa_b, theta.phi, theta.d_diaph_mm)
-        runs.append(Run(kind, variant, _listed(errors["chain"]), off, known))
+        runs.append(Run(kind, variant, _listed(errors["chain"]), off, known, "", _by_depth(scene.tissue, maps)))
         if variant == COMPLETE:
             runs += [Run("", name, _listed(errors[measure])) for name, measure in BEFORE.items()]
     return runs
@@ -160,5 +187,15 @@ def _listed(errors: np.ndarray) -> tuple[float | None, ...]:
     return tuple(round(float(e), 4) if np.isfinite(e) else None for e in errors)
 
 
-def _run(values: dict[str, Any]) -> Run:
-    return Run(**values)
+def _frozen(value: Any) -> Any:
+    """Tuples for what JSON has as lists."""
+    return tuple(_frozen(v) for v in value) if isinstance(value, list) else value
+
+
+def _by_depth(tissue: Tissue, maps: RunMaps) -> tuple[tuple[float | None, ...], ...]:
+    """Errors (mean, 95 %) of the whole chain between DENSE_DEPTHS_MM; points outside the lung count as the first."""
+    if len(tissue.ct) == 0:
+        return ()
+    bounds = (-np.inf, *DENSE_DEPTHS_MM[1:])
+    found = [tissue.errors(maps, *between) for between in pairwise(bounds)]
+    return tuple(_listed(np.array([s.mean, s.p95])) for s in found)
