@@ -110,7 +110,7 @@ def test_tissue_is_told_by_depth_and_only_where_both_scans_show_it(monkeypatch: 
     found = paper._by_depth(tissue, maps)
     assert found[0] == pytest.approx((2.0, 2.9))  # what lies outside the lung counts as its rim
     assert [mm[0] for mm in found] == [2.0, 5.0, 9.0, None, 7.0]
-    assert tissue.errors(maps).n == 5
+    assert len(tissue.errors_mm(maps)) == 5
     truth.dense = None
     assert paper._by_depth(Tissue.of(prepared, truth), maps) == ()
 

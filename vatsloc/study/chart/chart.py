@@ -212,7 +212,8 @@ def _tissue(tissue: Tissue, maps: RunMaps) -> dict[str, Any]:
     """Errors of the chain at tissue that both cone-beam CTs show; empty without dense truth."""
     if len(tissue.ct) == 0:
         return {}
-    found = {"tissue": tissue.errors(maps), "pleura": tissue.errors(maps, to_mm=PLEURA_MM)}
+    errors = tissue.errors_mm(maps)
+    found = {"tissue": summarize(errors), "pleura": summarize(errors[tissue.depth_mm < PLEURA_MM])}
     return {f"{name}_{what}": getattr(s, what) for name, s in found.items() for what in ("mean", "p95")}
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from poro.mesh import stuff
 from registration.volume import Array
 from vatsloc.evaluation.inputs import Truth, depth_below_pleura, seen_in
-from vatsloc.evaluation.statistics import TreStatistics, distances, summarize
+from vatsloc.evaluation.statistics import distances
 from vatsloc.evaluation.tre import RunMaps
 from vatsloc.maps import MeshMap
 from vatsloc.workflow.pneumothorax import Collapse
@@ -42,10 +42,9 @@ class Tissue:
         depth = depth_below_pleura(stuff(lung.inside, lung.ras_from_ijk, DEPTH_EDGE_MM), ct[seen])
         return cls(ct[seen], deflated[seen], depth)
 
-    def errors(self, maps: RunMaps, from_mm: float = -np.inf, to_mm: float = np.inf) -> TreStatistics:
-        """Of the whole chain at depths from_mm <= depth < to_mm."""
-        here = (self.depth_mm >= from_mm) & (self.depth_mm < to_mm)
-        return summarize(distances(maps.def_from_ct(self.ct), self.deflated)[here])
+    def errors_mm(self, maps: RunMaps) -> Array:
+        """Errors (n,) of the whole chain."""
+        return distances(maps.def_from_ct(self.ct), self.deflated)
 
 
 def run_maps(pose: ChangeOfPose, collapse: Collapse) -> RunMaps:

@@ -9,7 +9,6 @@ import json
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
-from itertools import pairwise
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,7 @@ import numpy as np
 from poro.fit import FitStatus
 from vatsloc.case import Case, read_case
 from vatsloc.errors import VatslocError
-from vatsloc.evaluation.evaluate import DENSE_DEPTHS_MM
+from vatsloc.evaluation.evaluate import errors_by_depth
 from vatsloc.evaluation.inputs import Truth, read_truth
 from vatsloc.evaluation.tre import RunMaps, target_registration_errors
 from vatsloc.formats.folder import write_whole
@@ -196,6 +195,5 @@ def _by_depth(tissue: Tissue, maps: RunMaps) -> tuple[tuple[float | None, ...], 
     """Errors (mean, 95 %) of the whole chain between DENSE_DEPTHS_MM; points outside the lung count as the first."""
     if len(tissue.ct) == 0:
         return ()
-    bounds = (-np.inf, *DENSE_DEPTHS_MM[1:])
-    found = [tissue.errors(maps, *between) for between in pairwise(bounds)]
-    return tuple(_listed(np.array([s.mean, s.p95])) for s in found)
+    classes = (told["chain"] for told in errors_by_depth({"chain": tissue.errors_mm(maps)}, tissue.depth_mm))
+    return tuple((None, None) if s is None else (round(s["mean"], 4), round(s["p95"], 4)) for s in classes)
