@@ -23,15 +23,7 @@ from poro.collapse import (
 from poro.collapse import StrainMeasure as Strain
 from poro.collapse.choice import StrainChoice
 from poro.fem import Tissue, neo_hookean
-from poro.fit import (
-    Fit,
-    FitSettings,
-    FitStatus,
-    Target,
-    constraints_to,
-    elastic_correction,
-    fit_collapse,
-)
+from poro.fit import Fit, FitSettings, FitStatus, Target, constraints_to, elastic_correction, fit_collapse
 from poro.fit.elastic_correction import ElasticCorrection
 from poro.mesh import TetMesh, interpolate, locate
 from registration.correspondences import Correspondences
@@ -142,13 +134,13 @@ def refined_model(
             model, training_only = select_refinement(steps, model, training_only, surface)
     if settings.model.correct:
         with stages.stage("elastic correction"):
-            data, before = fit_settings(settings), model.refinements
+            data = fit_settings(settings)
             steps = {f"elastic correction, strain {strain:g}": corrected(strain, data) for strain in CORRECTION_STRAINS}
             model, training_only = select_refinement(steps, model, training_only, surface)
-            if not any(refinement.kept for refinement in model.refinements[len(before) :]):
+            if not any(refinement.kept for refinement in model.refinements if refinement.name in steps):
                 steps = {
-                    f"{name}, held back": held_back(strain, data)
-                    for strain, name in zip(CORRECTION_STRAINS, steps, strict=True)
+                    f"elastic correction, strain {strain:g}, held back": held_back(strain, data)
+                    for strain in CORRECTION_STRAINS
                 }
                 model, training_only = select_refinement(steps, model, training_only, surface)
     return model, training_only
