@@ -75,7 +75,7 @@ def evaluate(truth: Truth, result: Result) -> Evaluation:
     """Errors of a result at the landmarks of a case. Ref: Alvarez 2021, section 8."""
     landmarks = truth.landmarks
     errors = target_registration_errors(landmarks, result.maps)
-    depth = depth_below_pleura(result.lung_ct, landmarks.ct)
+    depth = depth_below_pleura(result.whole_lung_ct, landmarks.ct)
     seen = {"inflated": landmarks.inflated, "deflated": landmarks.deflated}
     inside_fov = np.logical_and.reduce(
         [
@@ -161,7 +161,7 @@ def _dense(points: Array, truth: Truth, result: Result) -> tuple[dict[str, Any],
     scores: dict[str, Any] = {
         where: {m: asdict(summarize(e[at])) for m, e in errors.items()} for where, at in parts.items()
     }
-    depth = depth_below_pleura(result.lung_ct, ct)
+    depth = depth_below_pleura(result.whole_lung_ct, ct)
     scores["by_depth"] = _dense_by_depth({m: e[seen] for m, e in errors.items()}, depth[seen], radius[seen])
     return scores, {where: _held(errors["chain"][at], radius[at]) for where, at in parts.items()}
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from vatsloc.case import Landmarks, read_landmarks, sha256
 from vatsloc.errors import CaseError, InputRefused
 from vatsloc.evaluation.landmarks import LandmarkTriples, match
 from vatsloc.evaluation.tre import RunMaps
+from vatsloc.evaluation.whole_lung import whole_lung
 from vatsloc.formats.casefile import read_case_file
 from vatsloc.formats.fields import read_field
 from vatsloc.formats.folder import RUN_FILE, is_result
@@ -52,9 +54,9 @@ MAX_BEYOND_MM = 150.0
 class Result:
     """A results folder in memory.
 
-    run: run.json; lung_ct: for depths; nodule_*_ras: (3,) predictions, RAS mm; radius95_mm: (n,) at the lungs' nodes,
-    how far off the run holds its tissue to be at most (95 %), None in results from before it was written. Without an
-    inflated scan what belongs to it is None, and its maps are defined nowhere.
+    run: run.json; lung_ct: in the pieces that the run moved; nodule_*_ras: (3,) predictions, RAS mm; radius95_mm: (n,)
+    at the lungs' nodes, how far off the run holds its tissue to be at most (95 %), None in results from before it was
+    written. Without an inflated scan what belongs to it is None, and its maps are defined nowhere.
     """
 
     run: dict[str, Any]
@@ -65,6 +67,11 @@ class Result:
     nodule_inflated_ras: Array | None
     nodule_deflated_ras: Array
     radius95_mm: Array | None = None
+
+    @cached_property
+    def whole_lung_ct(self) -> TetMesh:
+        """The lung in the CT without the cut of the run, for depths below the pleura."""
+        return whole_lung(self.lung_ct)
 
 
 @dataclass(frozen=True)
