@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import solve_triangular
+from scipy.optimize import lsq_linear
 
 from poro.arrays import Array
 from poro.collapse.model import Theta
@@ -80,20 +82,16 @@ def descend(problem: FitProblem, theta: Array) -> Descent:
 
 
 def bounded_step(normal: Array, slope: Array, theta: Array, low: Array, high: Array, free: Array) -> Array:
-    """Gauss-Newton step; entries that would leave the box low..high stop at its side and the others are solved anew."""
-    step = np.zeros_like(theta)
-    moving = free.copy()
+    """Gauss-Newton step (k,) that promises most of all within the box low..high; parameters not free stay.
+
+    Ref: Stark & Parker 1995 (bounded-variable least squares).
+    """
     damped = normal + DAMPING * np.diag(np.maximum(np.diag(normal), 1e-12 * np.diag(normal).max()))
-    for _ in range(len(theta)):
-        inner = np.flatnonzero(moving)
-        if len(inner) == 0:
-            break
-        held = ~moving
-        right = -slope[inner] - damped[np.ix_(inner, np.flatnonzero(held))] @ step[held]
-        step[inner] = np.linalg.solve(damped[np.ix_(inner, inner)], right)
-        outside = moving & ((theta + step < low) | (theta + step > high))
-        if not outside.any():
-            break
-        step[outside] = np.clip(theta + step, low, high)[outside] - theta[outside]
-        moving &= ~outside
-    return step
+    step, moving = np.zeros_like(theta), np.flatnonzero(free & (low < high))
+    if len(moving):
+        unit = 1 / np.sqrt(np.diag(damped)[moving])
+        factor = np.linalg.cholesky(damped[np.ix_(moving, moving)] * unit[:, None] * unit)
+        sides = ((side - theta)[moving] / unit for side in (low, high))
+        wanted = solve_triangular(factor, -slope[moving] * unit, lower=True)
+        step[moving] = lsq_linear(factor.T, wanted, tuple(sides), method="bvls").x * unit
+    return np.clip(theta + step, low, high) - theta

@@ -33,7 +33,9 @@ CANDIDATES = 4
 class MatchSettings:
     """voxel_mm: of the images compared; cell_mm: at most one keypoint per cell; radius: of a block, voxels; reach_mm:
     how far a keypoint may have moved; least_ncc: of two blocks; round_trip_mm: how far from its start the way there and
-    back may end; outlier_mm: how far a keypoint may depart from the median motion of its neighbours.
+    back may end; outlier_mm: how far a keypoint may depart from the median motion of its neighbours; band_voxels:
+    standard deviations of two Gaussians whose difference is compared instead of grey values. What varies slowly, as
+    patches that lost their air do in one image alone, has no say then; vessels have.
     """
 
     voxel_mm: float = 2.0
@@ -44,6 +46,7 @@ class MatchSettings:
     round_trip_mm: float = 2.0
     outlier_mm: float = 5.0
     neighbours: int = 10
+    band_voxels: tuple[float, float] | None = None
 
 
 class _Scales(NamedTuple):
@@ -83,7 +86,7 @@ def match_keypoints(
     """
     settings = settings or MatchSettings()
     grid = fixed.grid.with_spacing(settings.voxel_mm)
-    here, there = smoothed(resample(fixed, grid)), smoothed(resample(moving, grid))
+    here, there = (smoothed(resample(image, grid), settings) for image in (fixed, moving))
     allowed = resample_mask(fixed_region, grid).inside
     believed = np.ones(grid.shape, bool) if moving_region is None else resample_mask(moving_region, grid).inside
     starts = detect_keypoints(here, allowed, settings)
@@ -121,9 +124,12 @@ def distinctiveness(hu: Array, spacing: Array) -> Array:
     return np.asarray(np.maximum(det, 0) / np.maximum(minors, 1e-6))
 
 
-def smoothed(volume: Volume) -> Volume:
-    """The image blurred by half a voxel, as all blocks are compared."""
-    return Volume(gaussian(volume.hu, 0.5), volume.ras_from_ijk)
+def smoothed(volume: Volume, settings: MatchSettings) -> Volume:
+    """The image as blocks are compared: blurred by half a voxel, or between two blurs."""
+    if settings.band_voxels is None:
+        return Volume(gaussian(volume.hu, 0.5), volume.ras_from_ijk)
+    fine, wide = (gaussian(volume.hu, sigma) for sigma in settings.band_voxels)
+    return Volume(fine - wide, volume.ras_from_ijk)
 
 
 def detect_keypoints(image: Volume, allowed: Array, settings: MatchSettings) -> Array:
@@ -145,7 +151,7 @@ def detect_inside(image: Volume, inside: Array, settings: MatchSettings) -> Arra
     inside.
     """
     nearest = ndimage.distance_transform_edt(~inside, return_distances=False, return_indices=True)
-    filled = smoothed(Volume(image.hu[tuple(nearest)], image.ras_from_ijk))
+    filled = smoothed(Volume(image.hu[tuple(nearest)], image.ras_from_ijk), settings)
     return detect_keypoints(filled, inside, settings)
 
 

@@ -66,8 +66,8 @@ def propagate_matches(
     `neighbours` tell no affine motion, and nothing is added.
     """
     match, grid = settings.match, fixed.grid.with_spacing(settings.match.voxel_mm)
-    here, inside = smoothed(resample(fixed, grid)), resample_mask(fixed_region, grid).inside
-    there = MaskedImage(smoothed(moving).hu, resample_mask(moving_region, moving.grid).inside)
+    here, inside = smoothed(resample(fixed, grid), match), resample_mask(fixed_region, grid).inside
+    there = MaskedImage(smoothed(moving, match).hu, resample_mask(moving_region, moving.grid).inside)
     matches = seeds
     if len(matches) <= settings.neighbours or not inside.any():
         return matches

@@ -11,7 +11,7 @@ import pytest
 from poro.arrays import Array
 from poro.collapse import PoroStatus, Theta
 from poro.fit import trust_region
-from poro.fit.trust_region import Descent, descend
+from poro.fit.trust_region import Descent, bounded_step, descend
 
 FREE = np.array([False, False, True])
 
@@ -56,3 +56,40 @@ def test_a_step_to_a_state_that_did_not_converge_is_refused(monkeypatch: pytest.
     found = descent(monkeypatch, 0.5)
     assert found.state.status is PoroStatus.SOLVED
     assert 0.5 <= abs(found.theta[2]) < 2.0
+
+
+def boxed(seed: int, free: Array) -> tuple[Array, Array, Array, Array, Array]:
+    """Normal equations whose parameters mean much the same, so that one that is stopped moves all the others."""
+    rng = np.random.default_rng(seed)
+    jacobian = rng.normal(size=(40, 6)) + 5 * rng.normal(size=(40, 1))
+    normal, slope = jacobian.T @ jacobian, jacobian.T @ rng.normal(0, 30, 40)
+    low, high = -rng.uniform(0.05, 1.0, 6), rng.uniform(0.05, 1.0, 6)
+    low[5] = high[5] = 0.0
+    return normal, slope, low, high, bounded_step(normal, slope, np.zeros(6), low, high, free)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_step_within_a_box_promises_more_than_any_step_beside_it(seed: int) -> None:
+    free = np.array([True, True, True, False, True, True])
+    normal, slope, low, high, step = boxed(seed, free)
+
+    def promised(step: Array) -> float:
+        return float(-(slope + 0.5 * normal @ step) @ step)
+
+    assert step[3] == step[5] == 0
+    assert ((low <= step) & (step <= high)).all()
+    assert promised(step) > 0
+    beside = np.random.default_rng(seed).normal(0, 0.05, (400, 6)) * free
+    others = np.clip(step + beside, low, high)
+    assert max(promised(other) for other in others) <= promised(step) * (1 + 1e-5)
+
+
+def test_some_parameters_come_off_the_side_of_the_box_that_the_free_step_would_have_hit() -> None:
+    """Stopping what leaves the box and solving for the rest would leave them there, and promise a rise."""
+    off = 0
+    for seed in range(8):
+        normal, slope, low, high, step = boxed(seed, np.ones(6, bool))
+        without = np.append(np.linalg.solve(normal[:5, :5], -slope[:5]), 0.0)
+        hit = (without < low) | (without > high)
+        off += int((hit & (low < step) & (step < high)).sum())
+    assert off > 0

@@ -72,3 +72,17 @@ def test_one_that_moves_against_its_neighbours_is_dropped() -> None:
     motion = 0.1 * points
     motion[7] += [9.0, 0.0, 0.0]
     assert np.flatnonzero(~moves_with_neighbours(points, motion, 10, 5.0)).tolist() == [7]
+
+
+def test_between_two_blurs_patches_of_one_image_alone_have_no_say() -> None:
+    """Tissue that lost its air by patches: the fixed image gets a slow pattern of its own, thrice as strong."""
+    shift = np.array([5.0, -3.0, 2.0])
+    vessels, patches = make_pattern(seed=3, waves=120, shortest_mm=7.0), make_pattern(seed=8, shortest_mm=25.0)
+    fixed = image_of(lambda points: vessels(points) + 3 * patches(points), GRID)
+    moving = image_of(lambda points: vessels(points - shift), GRID)
+
+    def right(settings: MatchSettings) -> int:
+        matches = match_keypoints(fixed, moving, EVERYWHERE, settings)
+        return int((np.linalg.norm(matches.moving - matches.fixed - shift, axis=1) < 2.0).sum())
+
+    assert right(MatchSettings(band_voxels=(0.7, 1.6))) > 2 * right(MatchSettings())

@@ -5,40 +5,66 @@ for about places to all sides of it too, in a smaller and a larger lung, and in 
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from poro.mesh import TetMesh
+from poro.fem import Tissue
+from poro.fit import PointConstraints, elastic_correction
+from poro.mesh import TetMesh, interpolate, locate
 from registration.correspondences import Correspondences
 from registration.images.morphology import dilate, erode
 from registration.images.resample import coarsen, resample_mask
+from registration.keypoints.groups import GroupSettings, in_groups
 from registration.keypoints.matching import MatchSettings, match_keypoints
 from registration.keypoints.propagation import PropagationSettings, propagate_matches
 from registration.volume import Array, Mask, Volume
 from vatsloc.maps import MeshMap, covered
+from vatsloc.workflow.fissures import mapped, smooth_map
 from vatsloc.workflow.observe import Observed
 from vatsloc.workflow.prepare import Prepared
+from vatsloc.workflow.refinement import unfolded
 from vatsloc.workflow.settings import KeypointSettings
 from vatsloc.workflow.warped_pair import warped_pair
 
 RIM_MM = 2.0
 """Blocks nearer than this to the lung's border also show what lies beyond it."""
 FEW = 400
-"""With fewer keypoints than this, more are looked for: in airless tissue, and one in every smaller cell."""
+"""With fewer keypoints than this, they are looked for anew, more widely."""
 SHIFT_MM = 12.0
 """How far aside of the model keypoints are then looked for, less than the reach, so that no gap is left."""
 SIZES = (0.85, 1.15)
 """And how much smaller and larger than modelled the lung may be, along every axis."""
 VOTERS, VOTES, ALIKE_MM = 6, 2, 8.0
 """A match found there counts if so many of so many neighbours move as it does, within ALIKE_MM."""
-SHRUNK_CELL_MM = 7.0
-"""What a cell of 10 mm becomes where the lung has shrunk to a third."""
+BAND_VOXELS = (0.7, 1.6)
+"""What is compared at first where few were found: tissue that loses its air by patches looks unlike itself, vessels do
+not."""
+SEED_CELL_MM, CELL_MM = 6.0, 5.0
+"""One keypoint in each such cell, instead of 10 mm: about the model, and propagated."""
+LEAST_NCC, REACH_MM, VOTES_BESIDE, AGREE_MM = 0.5, 6.0, 3, 3.0
+"""A propagated match correlates less, for its neighbours, more of them and more exactly, have to expect it there."""
+ROUNDS, MORE = 3, 1.2
+"""How often keypoints are looked for, and how many times as many have to be found for another time."""
+SIGMA_MM = 2.0
+"""Standard deviation of a keypoint that a lung follows in between."""
 ROOM_MM, AIRLESS_MM, GAS_RIM_MM = 6.0, 25.0, 1.5
 """Tissue is looked for so far beyond where the inflated lung was, so far from gas and aerated lung, and not so near to
 gas, where a voxel holds both."""
 BONE_HU = 150.0
+
+
+@dataclass(frozen=True)
+class _Regions:
+    """What is compared. deflated, inflated: CBCTs, the inflated one placed by the spine; lung: what may be lung in the
+    deflated one; before: where the inflated lung lay.
+    """
+
+    deflated: Volume
+    inflated: Volume
+    lung: Mask
+    before: Mask
 
 
 def find_correspondences(
@@ -49,23 +75,75 @@ def find_correspondences(
     `moving` is where they lie before the collapse, placed by the spine.
     """
     match = MatchSettings(voxel_mm=settings.voxel_mm, reach_mm=settings.reach_mm)
-    first = _near_model(prepared, observed, displacement, match)
+    near = _near_model(prepared, observed, displacement, match)
+    regions = _regions(prepared, observed, match)
+    found = _propagated(regions, near, PropagationSettings(match))
+    for band in (BAND_VOXELS, None) if len(found) < FEW else ():
+        seeds = replace(match, cell_mm=SEED_CELL_MM, band_voxels=band)
+        widely = _looked_for_widely(prepared, observed, displacement, regions, seeds)
+        if len(widely) > len(found):
+            return widely
+    return found
+
+
+def _regions(prepared: Prepared, observed: Observed, match: MatchSettings) -> _Regions:
     deflated, inflated = (coarsen(image.volume, match.voxel_mm) for image in (prepared.deflated, prepared.inflated))
     placed = Volume(inflated.hu, observed.def_from_inf_rigid.matrix @ inflated.ras_from_ijk)
-    before = _inner(
-        covered(observed.mesh_before, placed.grid),
-        resample_mask(prepared.inflated.field.usable, inflated.grid).inside,
-    )
+    usable = resample_mask(prepared.inflated.field.usable, inflated.grid).inside
+    before = _inner(covered(observed.mesh_before, placed.grid), usable)
     seen = resample_mask(prepared.deflated.field.usable, deflated.grid).inside
-    after = _inner(resample_mask(observed.found.lung, deflated.grid), seen)
-    found = propagate_matches(deflated, placed, after, before, first, PropagationSettings(match))
-    if len(found) >= FEW:
-        return found
-    for other in _others(observed.model_mesh.points, displacement):
-        first = first.joined(_near_model(prepared, observed, other, match))
-    found = propagate_matches(deflated, placed, after, before, _consistent(first), PropagationSettings(match))
-    after, finer = _inner(tissue(prepared, observed, deflated), seen), replace(match, cell_mm=SHRUNK_CELL_MM)
-    return propagate_matches(deflated, placed, after, before, found, PropagationSettings(finer))
+    return _Regions(deflated, placed, _inner(resample_mask(observed.found.lung, deflated.grid), seen), before)
+
+
+def _looked_for_widely(
+    prepared: Prepared, observed: Observed, displacement: Array, regions: _Regions, seeds: MatchSettings
+) -> Correspondences:
+    """Keypoints where the model may be far off: to all sides of it, in a smaller and in a larger lung, and in tissue
+    without air; then about a lung that follows those, as long as that finds many more.
+    """
+    mesh = observed.model_mesh
+    found, laid_out = Correspondences.none(), [displacement, *_others(mesh.points, displacement)]
+    for _ in range(ROUNDS):
+        first = found
+        for one in laid_out:
+            first = first.joined(_near_model(prepared, observed, one, seeds))
+        again = _moving_in_groups(prepared, observed, regions, _consistent(first), seeds)
+        if len(again) < MORE * len(found) or not len(again):
+            break
+        found = again
+        laid_out = [_following(mesh, start, found) for start in (displacement, _affine(mesh.points, found))]
+    return found
+
+
+def _moving_in_groups(
+    prepared: Prepared, observed: Observed, regions: _Regions, first: Correspondences, match: MatchSettings
+) -> Correspondences:
+    """What matches lead to, in the lung that was found and then in all that may be lung, where it moves in groups."""
+    how = PropagationSettings(
+        replace(match, cell_mm=CELL_MM, least_ncc=LEAST_NCC), reach_mm=REACH_MM, votes=VOTES_BESIDE, agree_mm=AGREE_MM
+    )
+    seen = resample_mask(prepared.deflated.field.usable, regions.deflated.grid).inside
+    everywhere = _inner(tissue(prepared, observed, regions.deflated), seen)
+    found = _propagated(replace(regions, lung=everywhere), _propagated(regions, first, how), how)
+    return found.only(in_groups(found, GroupSettings()))
+
+
+def _affine(points: Array, found: Correspondences) -> Array:
+    """Displacement (n, 3) mm of points (n, 3) by the affine map that keypoints follow best."""
+    centre = found.moving.mean(axis=0)
+    return mapped(smooth_map(found.moving - centre, found.fixed - found.moving, 1), points - centre)
+
+
+def _following(mesh: TetMesh, displacement: Array, found: Correspondences) -> Array:
+    """A displacement (n, 3) mm of a mesh and an elastic field on top that follows keypoints."""
+    off = found.fixed - found.moving - interpolate(locate(mesh, found.moving), displacement)
+    wanted = PointConstraints(found.moving, off, np.full(len(found), SIGMA_MM), np.zeros((len(found), 3)))
+    field = elastic_correction(mesh, displacement, Tissue(), wanted).u
+    return displacement + unfolded(mesh.points + displacement, field, mesh.tets)
+
+
+def _propagated(regions: _Regions, seeds: Correspondences, how: PropagationSettings) -> Correspondences:
+    return propagate_matches(regions.deflated, regions.inflated, regions.lung, regions.before, seeds, how)
 
 
 def _others(rest: Array, displacement: Array) -> list[Array]:
