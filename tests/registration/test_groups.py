@@ -29,7 +29,7 @@ def scene() -> tuple[Correspondences, Array]:
     stray = cloud(4, 40, (0, 0, 0))
     to = np.random.default_rng(5).uniform(-60, 60, (40, 3))
     fixed = np.concatenate([one, two, stray, few])
-    moving = np.concatenate([turned(one, (90, 0, 0)), two - [0, 50, 0], to, few + [20, 0, 0]])
+    moving = np.concatenate([turned(one, (90, 0, 0)), two - [0, 50, 0], to, few + np.array([20.0, 0, 0])])
     return Correspondences.of(fixed, moving), np.repeat([0, 1, 2, 3], [150, 60, 40, 12])
 
 
