@@ -31,6 +31,7 @@ from vatsloc.workflow.model_selection import (
     GAIN,
     CollapseModel,
     Refinement,
+    Step,
     _regional,
     corrected,
     fit_settings,
@@ -113,6 +114,28 @@ def test_the_best_is_taken_and_where_it_does_not_settle_the_next_best() -> None:
     model, training_only = select_refinement({"f": only_training, **steps}, start, start, a_surface())
     assert [refinement.name for refinement in model.refinements if refinement.kept] == ["b"]
     assert_allclose(training_only.displacement, 0.8 * motion(start.system.mesh.points))
+
+
+def test_where_nothing_settles_with_all_keypoints_the_best_trial_stays_if_it_may() -> None:
+    start = a_model(0.0)
+
+    def only_training(share: float) -> Step:
+        def step(model: CollapseModel, target: Target, begin: Fit) -> CollapseModel:
+            whole = len(target.inflated) == len(start.correspondences)
+            return replace(knows(share)(model, target, begin), fit=a_fit(start.displacement, settled=not whole))
+
+        return step
+
+    steps = {"a": only_training(0.6), "b": only_training(0.9), "c": only_training(0.02)}
+    without, _ = select_refinement(steps, start, start, a_surface())
+    assert not any(refinement.kept for refinement in without.refinements)
+    assert_array_equal(without.displacement, start.displacement)
+    model, training_only = select_refinement(steps, start, start, a_surface(), or_trial=True)
+    assert [refinement.name for refinement in model.refinements if refinement.kept] == ["b"]
+    assert_allclose(model.displacement, 0.9 * motion(start.system.mesh.points))
+    assert_array_equal(training_only.displacement, model.displacement)
+    model, _ = select_refinement({"c": steps["c"]}, start, start, a_surface(), or_trial=True)
+    assert not any(refinement.kept for refinement in model.refinements)
 
 
 def test_refinements_add_up_and_the_last_one_kept_says_what_remains() -> None:

@@ -131,7 +131,7 @@ def refined_model(
     if settings.model.regional:
         with stages.stage("regional fit"):
             steps = {"regional fit": _regional(settings)}
-            model, training_only = select_refinement(steps, model, training_only, surface)
+            model, training_only = select_refinement(steps, model, training_only, surface, or_trial=True)
     if settings.model.correct:
         with stages.stage("elastic correction"):
             data = fit_settings(settings)
@@ -147,12 +147,17 @@ def refined_model(
 
 
 def select_refinement(
-    steps: dict[str, Step], model: CollapseModel, training_only: CollapseModel, surface: Target
+    steps: dict[str, Step],
+    model: CollapseModel,
+    training_only: CollapseModel,
+    surface: Target,
+    or_trial: bool = False,
 ) -> tuple[CollapseModel, CollapseModel]:
     """Try each step on the training-only model, which is fitted without the held-out keypoints.
 
     The step that predicts these best, if better than without it by GAIN, is done again with all keypoints on the model
-    itself; where that does not settle, the next best one is.
+    itself; where that does not settle, the next best one is. Where none settles and `or_trial` is set, the best trial
+    is the model: most of the keypoints have told it where tissue went, and those held out agree.
     """
     mesh, found = model.system.mesh, model.correspondences
     hidden = held_out(found.fixed)
@@ -161,11 +166,14 @@ def select_refinement(
     before = misfit(mesh, training_only.displacement, tested)
     after = {name: misfit(mesh, trial.displacement, tested) for name, trial in trials.items() if _settled(trial)}
     best = None
-    for name in sorted((name for name, mm in after.items() if mm < GAIN * before), key=lambda name: after[name]):
+    better = sorted((name for name, mm in after.items() if mm < GAIN * before), key=lambda name: after[name])
+    for name in better:
         refined = steps[name](model, _with_keypoints(surface, found), trials[name].fit)
         if refined is not model and _settled(refined):
             best, model, training_only = name, refined, trials[name]
             break
+    if best is None and better and or_trial:
+        best, model, training_only = better[0], trials[better[0]], trials[better[0]]
     refinements = (*model.refinements, *(Refinement(name, before, mm, name == best) for name, mm in after.items()))
     return replace(model, refinements=refinements), training_only
 
