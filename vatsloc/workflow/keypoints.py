@@ -101,13 +101,15 @@ def _looked_for_widely(
     """Keypoints where the model may be far off: to all sides of it, in a smaller and in a larger lung, and in tissue
     without air; then about a lung that follows those, as long as that finds many more.
     """
+    seen = resample_mask(prepared.deflated.field.usable, regions.deflated.grid).inside
+    everywhere = replace(regions, lung=_inner(tissue(prepared, observed, regions.deflated), seen))
     mesh = observed.model_mesh
     found, laid_out = Correspondences.none(), [displacement, *_others(mesh.points, displacement)]
     for _ in range(ROUNDS):
         first = found
         for one in laid_out:
             first = first.joined(_near_model(prepared, observed, one, seeds))
-        again = _moving_in_groups(prepared, observed, regions, _consistent(first), seeds)
+        again = _moving_in_groups((regions, everywhere), _consistent(first), seeds)
         if len(again) < MORE * len(found) or not len(again):
             break
         found = again
@@ -115,16 +117,14 @@ def _looked_for_widely(
     return found
 
 
-def _moving_in_groups(
-    prepared: Prepared, observed: Observed, regions: _Regions, first: Correspondences, match: MatchSettings
-) -> Correspondences:
-    """What matches lead to, in the lung that was found and then in all that may be lung, where it moves in groups."""
+def _moving_in_groups(places: tuple[_Regions, ...], first: Correspondences, match: MatchSettings) -> Correspondences:
+    """What matches lead to in one place after the other, where it moves in groups."""
     how = PropagationSettings(
         replace(match, cell_mm=CELL_MM, least_ncc=LEAST_NCC), reach_mm=REACH_MM, votes=VOTES_BESIDE, agree_mm=AGREE_MM
     )
-    seen = resample_mask(prepared.deflated.field.usable, regions.deflated.grid).inside
-    everywhere = _inner(tissue(prepared, observed, regions.deflated), seen)
-    found = _propagated(replace(regions, lung=everywhere), _propagated(regions, first, how), how)
+    found = first
+    for regions in places:
+        found = _propagated(regions, found, how)
     return found.only(in_groups(found, GroupSettings()))
 
 
