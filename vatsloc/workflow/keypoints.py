@@ -1,6 +1,7 @@
 """Keypoints inside the lung matched between both cone-beam CTs: first about where a model of the collapse puts them,
 then by propagation from the matches to their neighbours. Where these are few, the model may be far off: they are looked
-for about places to all sides of it too, in a smaller and a larger lung, and in tissue without air.
+for anew about places to all sides of it, in a smaller and a larger lung, and in tissue without air, in a band of the
+images; those that move in large groups count, and once more about a lung that follows them.
 """
 
 from __future__ import annotations

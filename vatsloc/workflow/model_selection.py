@@ -108,7 +108,7 @@ def select_model(
         system, replace(plain, state=solid.state), solid.state.u, NO_CORRESPONDENCES, (), solid, NO_ENSEMBLE
     )
     model, training_only = refined_model(start, surface, prepared, observed, settings, stages)
-    if any(refinement.kept for refinement in model.refinements):
+    if training_only.displacement is not model.displacement:
         return replace(model, ensemble=(training_only.displacement - model.displacement)[None])
     with stages.stage("perturbation ensemble"):
         return replace(model, ensemble=perturbation_ensemble(system, surface, plain, fit_settings(settings)))
