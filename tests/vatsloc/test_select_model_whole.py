@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -28,6 +29,7 @@ from vatsloc.workflow import model_selection as module
 from vatsloc.workflow.model_selection import (
     NO_CORRESPONDENCES,
     CollapseModel,
+    Refinement,
     fit_settings,
     select_model,
 )
@@ -144,6 +146,21 @@ def test_without_a_refinement_the_plain_fit_stands_and_the_ensemble_says_how_sur
     assert known.asked["perturbation_ensemble"][2] is known.plain
     assert len(model.correspondences) == (0 if "keypoints" in skipped else len(pairs))
     assert len(NO_CORRESPONDENCES) == 0
+
+
+def test_a_fit_that_was_not_fitted_to_all_keypoints_has_the_ensemble_of_the_plain_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """It differs by nothing from the training-only model, which would say that it is certain."""
+    known = Selection(monkeypatch, pairs_of())
+
+    def trial_stays(model: CollapseModel, *_: Any) -> tuple[CollapseModel, CollapseModel]:
+        moved = 0.5 * motion(known.observed.model_mesh.points)
+        trial = replace(model, displacement=moved, refinements=(Refinement("regional fit", 5.0, 2.0, True),))
+        return trial, trial
+
+    monkeypatch.setattr(module, "refined_model", trial_stays)
+    assert_array_equal(known.run().ensemble, known.others)
 
 
 @pytest.mark.parametrize(("model", "tried"), [({}, True), ({"regional": False}, False)])
