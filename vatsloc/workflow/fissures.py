@@ -7,7 +7,7 @@ follow far better than one, and the gas beside the collapsed lung, whose border 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from scipy.optimize import minimize
 
 from poro.mesh.pieces import Pieces
 from registration.volume import Array
+from vatsloc.workflow.bend import Bend, bend_to
 
 SCALE_MM = 60.0
 """Lengths of a lung, by which coordinates are divided before they are multiplied with each other."""
@@ -42,14 +43,26 @@ _RIDGE = np.array([0.0, 0.3, 0.3, 0.3, 3.0, 3.0, 3.0, 3.0, 3.0, 3.0])
 @dataclass(frozen=True)
 class Sheet:
     """A bowed sheet through a lung. hilum: (3,) RAS mm; shape: (6,) mm up per mm forward and per mm to the right, mm it
-    passes below the hilum, and mm it bulges at 60 mm along both axes and between them.
+    passes below the hilum, and mm it bulges at 60 mm along both axes and between them; bend: its height over that.
     """
 
     hilum: Array
     shape: Array
+    bend: Bend | None = None
 
     def distance(self, points: Array) -> Array:
         """Signed distance (n,) mm of points (n, 3) from the sheet, along a plane's normal; positive above it."""
+        return self._unbent(points) - (0.0 if self.bend is None else self.bend.height(points))
+
+    def bent(self, points: Array, side: Array, gas: Array) -> Sheet:
+        """The sheet with points (n, 3) mm on their sides (n,), +1 above it or -1 below, along gas (k, 3)."""
+        slope, tilt = self.shape[:2]
+        first, normal = np.array([1.0, 0.0, -tilt]), np.array([tilt, slope, 1.0])
+        axes = np.stack([x / np.linalg.norm(x) for x in (first, np.cross(normal, first))])
+        told, airy = (points, self._unbent(points), side), (gas, self._unbent(gas))
+        return replace(self, bend=bend_to(self.hilum, axes, told, airy))
+
+    def _unbent(self, points: Array) -> Array:
         slope, tilt, offset, bow_x, bow_y, twist = self.shape
         x, y, z = (points - self.hilum).T
         u, v = x / SCALE_MM, y / SCALE_MM

@@ -15,17 +15,17 @@ from scipy.spatial import cKDTree
 
 from poro.fem import Tissue
 from poro.fit import Target, constraints_to, elastic_correction
-from poro.mesh import TetMesh, closest_points, interpolate, locate
+from poro.mesh import TetMesh, interpolate, locate
 from poro.mesh.pieces import Pieces, stuff_pieces
 from registration.correspondences import Correspondences
 from registration.images.resample import resample_mask
 from registration.volume import Array, Mask
-from vatsloc.imaging.surface import Border
 from vatsloc.maps import MeshMap, covered
-from vatsloc.workflow.fissures import LEAST_DEEP_MM, Fissure, Parted, find_fissure, mapped, smooth_map
+from vatsloc.workflow.fissures import Fissure, Parted, mapped, smooth_map
 from vatsloc.workflow.hold_out import held_out
 from vatsloc.workflow.model_selection import GAIN, Refinement, fit_settings, misfit
 from vatsloc.workflow.observe import Observed
+from vatsloc.workflow.parting import seen_fissure
 from vatsloc.workflow.pneumothorax import Collapse, residual_of_part
 from vatsloc.workflow.pose import ChangeOfPose
 from vatsloc.workflow.prepare import Prepared
@@ -36,9 +36,6 @@ from vatsloc.workflow.stages import Stages
 PIECES = "pieces"
 JOINED_MM = 20.0
 """About the hilum, pieces share their nodes."""
-GAS_REACH_MM = 20.0
-"""How far a keypoint may lie that tells where gas came from."""
-NEIGHBOURS = 4
 COARSE_MM = 2.0
 DEGREES, STRAINS = (1, 2), (0.05, 0.0125)
 LEAST_STRETCH = 0.1
@@ -77,22 +74,6 @@ def in_pieces(
         return pose, collapse
     with stages.stage(f"{PIECES}, residual registration"):
         return pose, _with_residual(prepared, pose, collapse, fissure, settings)
-
-
-def seen_fissure(pose: ChangeOfPose, collapse: Collapse) -> Fissure | None:
-    """The sheet along which keypoints and gas say that the lung parted, with what each of them says."""
-    found, observed = collapse.model.correspondences, collapse.observed
-    before = collapse.mesh_before
-    points, hilum = (
-        interpolate(locate(before, x), pose.mesh_ct.points) for x in (found.moving, observed.hilum.point_ras[None])
-    )
-    air = observed.surface.only(Border.AIR, Border.FISSURE).points
-    far, near = cKDTree(found.fixed).query(air, NEIGHBOURS)
-    known = far[:, 0] < GAS_REACH_MM
-    came_from = air[known] + (found.moving - found.fixed)[near[known]].mean(axis=1)
-    gas = interpolate(locate(before, came_from), pose.mesh_ct.points)
-    deep = -closest_points(pose.mesh_ct.boundary, gas).distance > LEAST_DEEP_MM
-    return find_fissure(points, found.fixed - found.moving, gas[deep], hilum[0], len(gas))
 
 
 def _why(fissure: Fissure | None) -> str:
