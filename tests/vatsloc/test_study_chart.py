@@ -24,6 +24,7 @@ from registration.sliding import LungImage
 from registration.volume import Mask, Volume
 from tests.vatsloc.browser import CHROMIUM, asked_by_the_page, visit
 from vatsloc.errors import CaseError, InputRefused
+from vatsloc.evaluation.tre import RunMaps
 from vatsloc.study.chart import chart
 from vatsloc.study.chart.chart import Row, append_row, measure_case, read_rows, run_chart
 from vatsloc.study.chart.draw import MARK, NUMBER, interactive, places, require_matplotlib, write_chart
@@ -43,7 +44,8 @@ def row(variant: str, case: str, *numbers: float) -> Row:
     cpu: dict[str, Any] = {f"{p}_cpu": 2 * named[f"{p}_seconds"] for p in ("phase1", "phase2", "chain")}
     tissue = {f"tissue_{what}": named[f"chain_{what}"] for what in ("mean", "p95")}
     tissue |= {f"pleura_{what}": 2 * named[f"chain_{what}"] for what in ("mean", "p95")}
-    return Row(variant, case, nodule_mm=numbers[9], load=1, **named, **cpu, **tissue)
+    after: dict[str, Any] = {"after_seconds": named["phase2_seconds"] + 3, "after_cpu": cpu["phase2_cpu"] + 6}
+    return Row(variant, case, nodule_mm=numbers[9], load=1, **named, **cpu, **after, **tissue)
 
 
 ROWS = [
@@ -151,8 +153,8 @@ def test_a_case_s_rows_hold_the_errors_and_the_seconds_of_what_each_variant_need
         stages.seconds |= {name.replace("_", " "): s for name, s in seconds.items()}
         stages.cpu_seconds |= {name: 10 * s for name, s in stages.seconds.items()}
 
-    def read(stages: Stages) -> Any:
-        took(stages, read=1.0, lungs=2.0)
+    def read(stages: Stages, **seconds: float) -> Any:
+        took(stages, **seconds)
         return SimpleNamespace(lung_ct=SimpleNamespace(inside=None, ras_from_ijk=None))
 
     def pose(_case: Any, _prepared: Any, settings: Any, stages: Stages, _register: Any) -> Any:
@@ -191,19 +193,35 @@ def test_a_case_s_rows_hold_the_errors_and_the_seconds_of_what_each_variant_need
     views = {"inflated": everywhere, "deflated": everywhere}
     known = SimpleNamespace(nodule_deflated_ras=CT[0] + MOVED)
     truth = SimpleNamespace(landmarks=landmarks, nodule=known, dense=dense, fields_of_view=views)
-    monkeypatch.setattr(chart, "read_case", lambda _folder: SimpleNamespace(nodule=nodule, gravity_ras=None))
+    case = SimpleNamespace(nodule=nodule, gravity_ras=None, cbct_inflated="seen")
+    monkeypatch.setattr(chart, "read_case", lambda _folder: case)
     monkeypatch.setattr(chart, "read_truth", lambda _folder: truth)
-    monkeypatch.setattr(chart, "prepare", lambda _case, stages: read(stages))
+    monkeypatch.setattr(
+        chart, "prepare_before", lambda _case, _scan, stages: read(stages, read=1.0, lungs=1.5, inflated=0.25)
+    )
+    monkeypatch.setattr(chart, "prepare", lambda _case, stages, _before: read(stages, deflated=0.25))
     monkeypatch.setattr(scored, "stuff", lambda *_mesh: None)
     monkeypatch.setattr(scored, "depth_below_pleura", lambda _mesh, points: np.array([4.0, 14.0])[: len(points)])
     monkeypatch.setattr(chart, "change_of_pose", pose)
     for step in (observe, modelled, refined):
         monkeypatch.setattr(chart, step.__name__, step)
     monkeypatch.setattr(chart, "in_pieces", lambda _prepared, pose, collapse, _settings, _stages: (pose, collapse))
-    names = ["rigid", "ffd-16", "balanced", "alone", "no-hilum"]
+
+    def told(stages: Stages, seconds: float, moved: float) -> Any:
+        took(stages, localize=seconds)
+        still, along = RigidTransform.identity(), np.array([0, moved, 0])
+        return RunMaps(still, still, still, still, still, lambda points: points + MOVED - along)
+
+    def bare(_case: Any, _settings: Any, before: Stages, after: Stages) -> Any:
+        took(before, lungs=2.0)
+        return told(after, 9.0, 0.25)
+
+    monkeypatch.setattr(chart, "without_inflated", bare)
+    monkeypatch.setattr(chart, "foreseen", lambda _case, _prepared, stages: told(stages, 1.5, 4.0))
+    names = ["rigid", "ffd-16", "balanced", "alone", "no-hilum", "two-scans", "one-scan"]
     chosen = {name: replace(variant, select=select) for name, variant in chosen_variants(names).items()}
     rows = {row.variant: row for row in measure_case(tmp_path / "case", chosen)}
-    rigid, pose_only, balanced, alone, failed = (rows[name] for name in names)
+    rigid, pose_only, balanced, alone, failed, two, one = (rows[name] for name in names)
     assert (rigid.phase1_mean, rigid.phase2_mean) == (1, 2)
     assert rigid.chain_mean == pytest.approx(math.sqrt(5))
     assert (rigid.phase1_seconds, rigid.phase2_seconds) == (0.5, 0.25)
@@ -215,10 +233,22 @@ def test_a_case_s_rows_hold_the_errors_and_the_seconds_of_what_each_variant_need
     assert balanced.nodule_mm == pytest.approx(math.hypot(1, 0.5))
     assert balanced.pleura_mean == pytest.approx(math.hypot(1, 0.5))
     assert balanced.chain_seconds == pytest.approx(15, abs=0.1)
+    assert balanced.after_seconds == pytest.approx(8.25)  # the deflated scan and phase 2
     assert balanced.left_out == "residual registration"
     assert (alone.phase2_mean, alone.phase2_seconds) == (1, 7)  # without blocks
     assert (rigid.phase2_cpu, balanced.phase2_cpu) == (2.5, 80)
+    assert (two.chain_mean, two.nodule_mm, two.pleura_mean) == (0.25, 0.25, 0.25)
+    assert (two.after_seconds, two.after_cpu) == (9, 90)
+    assert two.chain_seconds == pytest.approx(12, abs=0.1)  # reading and the CT's lungs before
+    assert math.isnan(two.phase1_mean)
+    assert (one.chain_mean, one.after_seconds) == (4, 1.5)
     assert failed.failed == "the contact of the collapsing lung did not settle"
+
+
+def test_a_case_without_an_inflated_scan_is_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(chart, "read_case", lambda _folder: SimpleNamespace(cbct_inflated=None))
+    with pytest.raises(InputRefused, match="no inflated CBCT"):
+        next(measure_case(tmp_path, chosen_variants(["two-scans"])))
 
 
 def test_every_variant_s_settings_are_valid_and_unknown_names_are_refused() -> None:
@@ -296,6 +326,19 @@ def test_the_page_says_what_the_model_is_worth_and_what_auto_saves() -> None:
     text = page(rows, points_of(rows, VARIANTS))
     assert "| elastic | balanced | +1.20 | +1.20 |" in text
     assert "| a | y | 8.0 | +0.10 | -0.10 |" in text
+
+
+def test_the_page_says_what_fewer_scans_cost_where_all_have_an_answer() -> None:
+    two = replace(ROWS[4], variant="two-scans", chain_mean=0.9, pleura_mean=2.5, after_seconds=45.0, nodule_mm=0.5)
+    none = Row("two-scans", "b", failed="nothing is seen")
+    rows = [*ROWS[4:6], two, none]
+    text = page(rows, points_of(rows, VARIANTS))
+    assert "### Fewer scans: mean mm over a, and median s" in text
+    assert "| balanced | CT, inflated and deflated CBCT | 33.0 | 0.60 | 0.60 | 1.20 | 0.30 |" in text
+    assert "| two-scans | CT, deflated CBCT | 45.0 | 0.90 | 0.60 | 2.50 | 0.50 |" in text
+    assert "one-scan" not in text
+    assert "Fewer scans" not in page(ROWS, points_of(ROWS, VARIANTS))
+    assert "Fewer scans" not in page([ROWS[5], none], points_of([ROWS[5], none], VARIANTS))
 
 
 @pytest.mark.parametrize("crowd", [1, 6, 20])

@@ -18,13 +18,14 @@ from vatsloc.errors import InputRefused, NotConverged, VatslocError
 from vatsloc.evaluation.inputs import Truth, read_truth
 from vatsloc.evaluation.statistics import summarize
 from vatsloc.evaluation.tre import RunMaps, target_registration_errors
+from vatsloc.study.chart.fewer_scans import foreseen, without_inflated
 from vatsloc.study.chart.variants import Scored, Variant
 from vatsloc.study.cohort.scored import Tissue, run_maps
 from vatsloc.workflow.observe import observe
 from vatsloc.workflow.parted import in_pieces
 from vatsloc.workflow.pneumothorax import Collapse, modelled, pneumothorax, refined
 from vatsloc.workflow.pose import ChangeOfPose, change_of_pose
-from vatsloc.workflow.prepare import Prepared, prepare
+from vatsloc.workflow.prepare import Prepared, prepare, prepare_before
 from vatsloc.workflow.settings import load_settings
 from vatsloc.workflow.stages import Say, Stages, quiet
 
@@ -40,7 +41,8 @@ NAN = float("nan")
 class Row:
     """One variant on one case. *_mean, *_p95: target registration errors, mm; *_seconds: of a phase's own stages, the
     chain's from the images on disk to the nodule's place, reading and preparation included; *_cpu: the same as
-    processor seconds, which other programs disturb less; tissue_*, pleura_*: errors of the chain at tissue that both
+    processor seconds, which other programs disturb less; after_*: what is left to do once the last scan is there and
+    read; tissue_*, pleura_*: errors of the chain at tissue that both
     cone-beam CTs show, everywhere and within `PLEURA_MM` of the pleura; left_out: parts that the scene did not need;
     load: processes that ran on the machine at its end; failed: why there is no number.
     """
@@ -59,6 +61,8 @@ class Row:
     chain_p95: float = NAN
     chain_seconds: float = NAN
     chain_cpu: float = NAN
+    after_seconds: float = NAN
+    after_cpu: float = NAN
     tissue_mean: float = NAN
     tissue_p95: float = NAN
     pleura_mean: float = NAN
@@ -122,13 +126,17 @@ class _Cost:
 
 @dataclass
 class _CaseRuns:
-    """A case whose images are read and prepared once; what that took counts for every variant's chain."""
+    """A case whose images are read and prepared once; what that took counts for every variant's chain. read,
+    last: what reading and the deflated scan's preparation took of that.
+    """
 
     case: Case
     truth: Truth
     prepared: Prepared
     tissue: Tissue
     cost: _Cost
+    read: _Cost
+    last: _Cost
     poses: dict[str, tuple[ChangeOfPose, Stages]] = field(default_factory=dict)
 
     def pose(self, variant: Variant) -> tuple[ChangeOfPose, Stages]:
@@ -145,15 +153,20 @@ class _CaseRuns:
 
 def measure_case(folder: Path, variants: Mapping[str, Variant]) -> Iterator[Row]:
     """A row per variant. What a user can act on becomes the row's `failed`."""
-    stages = Stages()
+    stages, last = Stages(), Stages()
     with stages.stage("read"):
         case = read_case(folder)
-    prepared, truth = prepare(case, stages), read_truth(folder)
-    runs = _CaseRuns(case, truth, prepared, Tissue.of(prepared, truth), _Cost.of(stages))
+    if case.cbct_inflated is None:
+        raise InputRefused(f"{folder} has no inflated CBCT; the chart holds every variant against three scans.")
+    before = prepare_before(case, case.cbct_inflated, stages)
+    prepared, truth = prepare(case, last, before), read_truth(folder)
+    tissue, cost = Tissue.of(prepared, truth), _Cost.of(stages) + _Cost.of(last)
+    runs = _CaseRuns(case, truth, prepared, tissue, cost, _Cost.of(stages, "read"), _Cost.of(last))
+    ways = {Scored.SPINES: _spines, Scored.CHAIN: _fewer_scans}
     for name, variant in variants.items():
         row = Row(name, folder.resolve().name)
         try:
-            row = _spines(runs, variant, row) if variant.scored is Scored.SPINES else _run(runs, variant, row)
+            row = ways.get(variant.scored, _run)(runs, variant, row)
         except (VatslocError, ImportError) as error:
             row = replace(row, failed=str(error).split("\n")[0])
         yield replace(row, load=os.getloadavg()[0])
@@ -172,7 +185,21 @@ def _run(runs: _CaseRuns, variant: Variant, row: Row) -> Row:
         raise NotConverged("the contact of the collapsing lung did not settle")
     maps = run_maps(pose, collapse)
     row = replace(row, left_out=_left_out(before, stages))
+    row = replace(row, **(runs.last + _Cost.of(stages)).named("after"))
     return _told(runs, maps, row, phase1, _Cost.of(stages))
+
+
+def _fewer_scans(runs: _CaseRuns, variant: Variant, row: Row) -> Row:
+    """The chain alone: its landmarks, tissue and nodule, and what it took with reading all scans."""
+    before, after = Stages(), Stages()
+    if variant.scans == 1:
+        maps = foreseen(runs.case, runs.prepared, after)
+    else:
+        maps = without_inflated(runs.case, variant.settings, before, after)
+    row = replace(row, left_out=_left_out(before, after), **_nodule_and_tissue(runs, maps))
+    took = runs.read + _Cost.of(before) + _Cost.of(after)
+    row = replace(row, **took.named("chain"), **_Cost.of(after).named("after"))
+    return _scored(runs.truth, maps, row, ("chain",))
 
 
 def _collapse(runs: _CaseRuns, variant: Variant, pose: ChangeOfPose, stages: Stages) -> tuple[ChangeOfPose, Collapse]:
@@ -202,19 +229,19 @@ def _spines(runs: _CaseRuns, variant: Variant, row: Row) -> Row:
 
 def _told(runs: _CaseRuns, maps: RunMaps, row: Row, phase1: _Cost, phase2: _Cost) -> Row:
     """The row with errors at landmarks, tissue and nodule, and what both phases took."""
-    nodule = maps.def_from_ct(runs.case.nodule.centre_ras[None])
-    row = replace(row, nodule_mm=_off(nodule, runs.truth), **_tissue(runs.tissue, maps))
+    row = replace(row, **_nodule_and_tissue(runs, maps))
     row = replace(row, **phase1.named("phase1"), **phase2.named("phase2"))
     return _scored(runs.truth, maps, replace(row, **(runs.cost + phase1 + phase2).named("chain")), PHASES)
 
 
-def _tissue(tissue: Tissue, maps: RunMaps) -> dict[str, Any]:
-    """Errors of the chain at tissue that both cone-beam CTs show; empty without dense truth."""
-    if len(tissue.ct) == 0:
-        return {}
-    errors = tissue.errors_mm(maps)
-    found = {"tissue": summarize(errors), "pleura": summarize(errors[tissue.depth_mm < PLEURA_MM])}
-    return {f"{name}_{what}": getattr(s, what) for name, s in found.items() for what in ("mean", "p95")}
+def _nodule_and_tissue(runs: _CaseRuns, maps: RunMaps) -> dict[str, Any]:
+    """Errors of the chain at the nodule, and at tissue that both cone-beam CTs show where there is dense truth."""
+    nodule = {"nodule_mm": _off(maps.def_from_ct(runs.case.nodule.centre_ras[None]), runs.truth)}
+    if len(runs.tissue.ct) == 0:
+        return nodule
+    errors = runs.tissue.errors_mm(maps)
+    found = {"tissue": summarize(errors), "pleura": summarize(errors[runs.tissue.depth_mm < PLEURA_MM])}
+    return nodule | {f"{name}_{what}": getattr(s, what) for name, s in found.items() for what in ("mean", "p95")}
 
 
 def _left_out(*logs: Stages) -> str:

@@ -6,13 +6,15 @@ import csv
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from statistics import fmean
+from statistics import fmean, median
 
 from vatsloc.study.chart.chart import PLEURA_MM, Row
 from vatsloc.study.chart.points import CLOCKS, COUNTED, MEASURES, PHASE_TITLES, Point, told_of_presets
 
 WITHOUT_MODEL = ("balanced", "elastic", "spline", "alone", "elastic-alone", "spline-alone")
 """What the poroelastic model is held against, followed by the images and alone."""
+SCANS = {"balanced": "CT, inflated and deflated CBCT", "two-scans": "CT, deflated CBCT", "one-scan": "CT"}
+"""Variants that differ in the scans they use."""
 AUTO, ITS_ALL = "auto", "balanced"
 """The preset that leaves out, and the one that leaves nothing out."""
 
@@ -47,7 +49,7 @@ def page(rows: Sequence[Row], points: Sequence[Point], clock: str = "seconds") -
     lines += [tissue, "", *by_case(rows, cases, tissue_cell), ""]
     landmarks = "### Phase 2 by case, mean / 95 % at the landmarks; nodule, mm"
     lines += [landmarks, "", *by_case(rows, cases, phase2_cell), ""]
-    lines += worth_of_the_model(rows, cases) + saved_by_auto(rows, cases, clock)
+    lines += with_fewer_scans(rows, clock) + worth_of_the_model(rows, cases) + saved_by_auto(rows, cases, clock)
     lines += ["### Presets", "", *(f"- {sentence}" for sentence in told_of_presets(points)), ""]
     failed = [row for row in rows if row.failed]
     if failed:
@@ -76,6 +78,33 @@ def by_case(rows: Sequence[Row], cases: Sequence[str], cell: Callable[[Row], str
     for variant in dict.fromkeys(variant for (variant, _), text in told.items() if text):
         lines.append(f"| {variant} | {' | '.join(told.get((variant, case), '') for case in cases)} |")
     return lines
+
+
+def with_fewer_scans(rows: Sequence[Row], clock: str) -> list[str]:
+    """What fewer scans cost in mm, and how long the last scan waits for an answer, on cases that all of them answer."""
+    by_name = _by_name(rows)
+    chosen = [name for name in SCANS if name in by_name]
+    answered = [{case for case, row in by_name[name].items() if not row.failed} for name in chosen]
+    common = sorted(set.intersection(*answered)) if len(chosen) > 1 else []
+    if not common:
+        return []
+    lines = [
+        f"### Fewer scans: mean mm over {', '.join(common)}, and median s from the last scan, read, to the answer",
+        "",
+    ]
+    lines += [
+        f"| variant | scans | {CLOCKS[clock]} after the last | landmarks | tissue in view | within {PLEURA_MM:g} mm "
+        "of the pleura | nodule |",
+        "|---" * 7 + "|",
+    ]
+    for name in chosen:
+        own = [by_name[name][case] for case in common]
+        means = [
+            fmean(getattr(row, c) for row in own) for c in ("chain_mean", "tissue_mean", "pleura_mean", "nodule_mm")
+        ]
+        waited = median(getattr(row, f"after_{clock}") for row in own)
+        lines.append(f"| {name} | {SCANS[name]} | {waited:.1f} | {' | '.join(f'{mm:.2f}' for mm in means)} |")
+    return [*lines, ""]
 
 
 def worth_of_the_model(rows: Sequence[Row], cases: Sequence[str]) -> list[str]:

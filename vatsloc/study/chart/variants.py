@@ -33,6 +33,7 @@ class Scored(Enum):
     POSE = "the change of pose; it runs no further"
     COLLAPSE = "the pneumothorax and the chain; its change of pose is another variant's"
     ALL = "both phases and the chain"
+    CHAIN = "the chain; fewer scans than phases need were taken"
 
 
 PANELS = {
@@ -40,6 +41,7 @@ PANELS = {
     Scored.POSE: ("phase1",),
     Scored.COLLAPSE: ("phase2", "chain", "pleura"),
     Scored.ALL: ("phase1", "phase2", "chain", "pleura"),
+    Scored.CHAIN: ("chain", "pleura"),
 }
 """Panels of the chart that show a variant."""
 
@@ -47,7 +49,8 @@ PANELS = {
 @dataclass(frozen=True)
 class Variant:
     """says: what it is, for the reader; over: settings that differ from the preset's; register: of phase 1; select: the
-    model of phase 2; blocks: whether the collapsed lung follows small blocks of the CT; pieces: whether it may be cut.
+    model of phase 2; blocks: whether the collapsed lung follows small blocks of the CT; pieces: whether it may be cut;
+    scans: how many are used, three of them with the inflated one, one is the CT.
     """
 
     says: str
@@ -58,6 +61,7 @@ class Variant:
     select: Select = select_model
     blocks: bool = True
     pieces: bool = True
+    scans: int = 3
 
     @property
     def settings(self) -> Settings:
@@ -185,6 +189,8 @@ VARIANTS: dict[str, Variant] = {
     **{f"linear-{edge}": _solid(edge, finite=False) for edge in (12, 8, 5)},
     **{f"finite-{edge}": _solid(edge, finite=True) for edge in (12, 8, 5)},
     **{name: Variant(f"preset {name}", Scored.ALL, preset=name) for name in PRESETS},
+    "two-scans": Variant("two scans: no inflated CBCT", Scored.CHAIN, scans=2),
+    "one-scan": Variant("one scan: a forecast from the CT, put where the spine lies", Scored.CHAIN, scans=1),
 }
 """Every variant by name. The order is that of their runs."""
 
