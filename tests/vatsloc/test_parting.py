@@ -14,7 +14,7 @@ from vatsloc.imaging.hilum import Hilum
 from vatsloc.imaging.surface import Border, SurfacePoints
 from vatsloc.workflow import parting as module
 from vatsloc.workflow.fissures import Fissure, Sheet
-from vatsloc.workflow.parting import LEAST_CLEAR, _bent, _came_from, _Seen, _seen, _sides, seen_fissure
+from vatsloc.workflow.parting import LEAST_CLEAR, _bare_mm, _bent, _came_from, _Seen, _seen, _sides, seen_fissure
 
 BEFORE_FROM_CT = known.as_affine(known.DEF_FROM_INF_RIGID) @ known.INF_FROM_CT
 APART = np.array([[9.0, 0, 6.0], [-9.0, 0, -6.0]])  # mm, of what lies above the fissure and below it
@@ -95,6 +95,20 @@ def test_a_side_with_few_clear_keypoints_bends_nothing() -> None:
     assert _bent(PLANE, found) is PLANE
 
 
+def test_the_piece_that_is_told_less_says_how_far_half_of_it_lies_from_its_own_keypoints() -> None:
+    found, points, _ = seen()
+    nodes = known.scene().pose.mesh_ct.points
+    upper, lower = points[points[:, 2] > known.CENTRE[2]], points[points[:, 2] < known.CENTRE[2]]
+    one = replace(found, points=np.concatenate([upper, lower[:1]]))
+    below = nodes[nodes[:, 2] <= known.CENTRE[2]]
+    far = np.median(np.linalg.norm(below - lower[0], axis=1))
+    assert _bare_mm(PLANE, one) == pytest.approx(far)
+    assert _bare_mm(PLANE, found) < 0.5 * far
+    assert _bare_mm(PLANE, replace(found, points=upper)) == np.inf
+    high = replace(PLANE, shape=np.array([0.0, 0, -200, 0, 0, 0]))  # all of the lung lies below
+    assert _bare_mm(high, found) == np.inf
+
+
 @pytest.mark.parametrize("gas_share", [0.9, 0.1])
 def test_only_what_both_support_is_bent(monkeypatch: pytest.MonkeyPatch, gas_share: float) -> None:
     found, _, _ = seen()
@@ -103,4 +117,5 @@ def test_only_what_both_support_is_bent(monkeypatch: pytest.MonkeyPatch, gas_sha
     fissure = seen_fissure(found.pose, found.collapse)
     assert fissure is not None
     assert (fissure.sheet.bend is not None) == (gas_share == 0.9)
+    assert (fissure.bare_mm > 0) == (gas_share == 0.9)
     assert (fissure.cost_share, fissure.gas, fissure.gas_share, fissure.border) == (0.5, 100, gas_share, 200)

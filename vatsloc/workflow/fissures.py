@@ -74,7 +74,8 @@ class Sheet:
 class Fissure:
     """A sheet along which the lung may have parted. cost_share: cost of two smooth maps of the keypoints' motion over
     that of one; gas: how many points of gas came into the lung; gas_share: of them, those that lie beside the sheet;
-    border: of how many points of the gas's border it is known where they came from.
+    border: of how many points of the gas's border it is known where they came from; bare_mm: how far half of the piece
+    that is told less lies from keypoints of its own, not known (0) without two kinds of evidence.
     """
 
     sheet: Sheet
@@ -82,6 +83,7 @@ class Fissure:
     gas: int
     gas_share: float
     border: int
+    bare_mm: float = 0.0
 
     def unexplained(self, is_cut: bool) -> float:
         """Share of the gas's border that came from inside the lung and, if the lung is cut, not from the sheet."""

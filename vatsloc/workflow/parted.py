@@ -38,6 +38,9 @@ JOINED_MM = 20.0
 """About the hilum, pieces share their nodes."""
 COARSE_MM = 2.0
 DEGREES, STRAINS = (1, 2), (0.05, 0.0125)
+COVERED_MM = 30.0
+"""How far half of a piece may lie from its own keypoints: farther off nothing tells where it went, and held-out
+keypoints, which lie near others, do not notice."""
 LEAST_STRETCH = 0.1
 """Smallest det of the gradient of a map that a piece may be laid out by."""
 
@@ -60,7 +63,7 @@ def in_pieces(
         return pose, collapse
     with stages.stage(PIECES):
         fissure = seen_fissure(pose, collapse)
-    if fissure is None or len(fissure.evidence) < 2:
+    if fissure is None or len(fissure.evidence) < 2 or fissure.bare_mm > COVERED_MM:
         stages.skip(PIECES, _why(fissure))
         return pose, replace(collapse, fissure=fissure)
     with stages.stage(f"{PIECES}, fit"):
@@ -79,6 +82,8 @@ def in_pieces(
 def _why(fissure: Fissure | None) -> str:
     if fissure is None:
         return "too few keypoints to tell pieces apart"
+    if len(fissure.evidence) == 2:
+        return f"half of a piece would lie over {fissure.bare_mm:.0f} mm from its own keypoints, {COVERED_MM:g} allowed"
     cost, share = f"{fissure.cost_share:.2f}", f"{100 * fissure.gas_share:.0f} %"
     return f"two smooth maps cost {cost} of one at keypoints, {share} of {fissure.gas} points of gas lie along a sheet"
 

@@ -69,7 +69,8 @@ def seen_fissure(pose: ChangeOfPose, collapse: Collapse) -> Fissure | None:
     found = find_fissure(seen.points, seen.motion, seen.deep(gas), seen.hilum, len(gas))
     if found is None or len(found.evidence) < 2:
         return found
-    return replace(found, sheet=_bent(found.sheet, seen))
+    sheet = _bent(found.sheet, seen)
+    return replace(found, sheet=sheet, bare_mm=_bare_mm(sheet, seen))
 
 
 def _seen(pose: ChangeOfPose, collapse: Collapse) -> _Seen:
@@ -88,6 +89,18 @@ def _bent(sheet: Sheet, seen: _Seen) -> Sheet:
         gas = [seen.deep(seen.in_ct(_came_from(seen, clear, side, number))) for number in (1, -1)]
         out = sheet.bent(seen.points[clear], side[clear], np.concatenate(gas))
     return out
+
+
+def _bare_mm(sheet: Sheet, seen: _Seen) -> float:
+    """How far half of the CT's lung on one side lies from that side's keypoints, mm: the larger of both, inf where a
+    side holds no lung or no keypoint.
+    """
+    nodes = seen.pose.mesh_ct.points
+    above, of_keypoint = sheet.distance(nodes) > 0, sheet.distance(seen.points) > 0
+    pairs = ((nodes[above == side], seen.points[of_keypoint == side]) for side in (True, False))
+    return max(
+        float(np.median(cKDTree(told).query(piece)[0])) if len(piece) and len(told) else np.inf for piece, told in pairs
+    )
 
 
 def _sides(sheet: Sheet, seen: _Seen) -> tuple[Array, Array]:
