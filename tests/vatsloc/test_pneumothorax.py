@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -191,12 +192,23 @@ def test_blocks_of_the_ct_refine_what_model_and_images_made(monkeypatch: pytest.
     assert shape.rest is parts.before
     assert shape.map.mesh is parts.pose.mesh_ct
     assert_allclose(shape.map.around.matrix, (scene.DEF_FROM_INF @ scene.INF_FROM_CT).matrix, atol=1e-12)
-    assert (len(shape.anchors), shape.within_mm) == (0, np.inf)
+    assert (len(shape.anchors), shape.within_mm, shape.cut) == (0, np.inf, None)
     inner = scene.inner_nodes(parts.before, scene.CENTRE_DEF, 35.0)
     truth = scene.collapsed(parts.before.points)
     assert_allclose((shape.map.moved - images.displacement)[inner], truth[inner], atol=1e-6)
     assert_array_equal(found.points_after, shape.map.moved + parts.off)
     assert found.refinement is not None
+
+
+def test_blocks_of_a_cut_lung_know_the_cut(monkeypatch: pytest.MonkeyPatch) -> None:
+    parts = Parts()
+    found = parts.run(monkeypatch, None)
+    cut: Any = SimpleNamespace(fissure=SimpleNamespace(sheet=SimpleNamespace(distance=lambda points: points[:, 2])))
+    case: Any = SimpleNamespace(ct=scene.ct())
+    refined(case, parts.prepared, parts.pose, replace(found, parted=cut), settings_of("balanced", {}), parts.stages)
+    told = parts.refined[-1][1].cut
+    assert told is not None
+    assert_array_equal(told(np.array([[1.0, 2.0, 3.0]])), [3.0])
 
 
 def test_a_refinement_that_is_switched_off_is_not_asked(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -120,6 +120,20 @@ def test_anchors_stay_and_deep_blocks_are_left_out() -> None:
     assert Lung.error(found.points)[Lung.depth < 8.0].mean() < 0.6 * Lung.error(Lung.start)[Lung.depth < 8.0].mean()
 
 
+def test_blocks_about_a_cut_are_not_followed() -> None:
+    def above(points: Array) -> Array:
+        return np.asarray((points - scene.CENTRE_CT)[:, 2] - 7.0)
+
+    uncut = refine_by_blocks(compared(), Lung.shape(np.zeros(0, int)), ON)
+    cut = refine_by_blocks(compared(), replace(Lung.shape(np.zeros(0, int)), cut=above), ON)
+    assert uncut.followed is not None
+    assert cut.followed is not None
+    assert (np.abs(above(uncut.followed.moving)) < module.BESIDE_CUT_MM).sum() > 20
+    assert np.abs(above(cut.followed.moving)).min() >= module.BESIDE_CUT_MM
+    beside = (np.abs(above(uncut.followed.moving)) < module.BESIDE_CUT_MM).mean()
+    assert len(cut.followed) == pytest.approx((1 - beside) * len(uncut.followed), rel=0.05)
+
+
 def test_of_the_scan_s_points_those_are_followed_that_lie_near_the_pleura_before_the_collapse() -> None:
     """Points of tissue are taken back to the CT, where the lung is a ball, by maps in closed form."""
     within = 8.0

@@ -125,11 +125,14 @@ def refined(
         return collapse
     with stages.stage(REFINEMENT):
         around = collapse.def_from_inf_rigid @ pose.inf_from_ct_rigid
-        refinement = refine_by_blocks(
-            Compared(case.ct, prepared.lung_ct, prepared.deflated, collapse.observed.found.lung),
-            Shape(collapse.mesh_before, MeshMap(pose.mesh_ct, collapse.points_after, around), np.zeros(0, dtype=int)),
-            settings.refinement,
+        shape = Shape(
+            collapse.mesh_before,
+            MeshMap(pose.mesh_ct, collapse.points_after, around),
+            np.zeros(0, dtype=int),
+            cut=None if collapse.parted is None else collapse.parted.fissure.sheet.distance,
         )
+        compared = Compared(case.ct, prepared.lung_ct, prepared.deflated, collapse.observed.found.lung)
+        refinement = refine_by_blocks(compared, shape, settings.refinement)
     return replace(collapse, points_after=refinement.points, refinement=refinement)
 
 

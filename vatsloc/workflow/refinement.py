@@ -7,6 +7,7 @@ them, and such blocks are found only where a map is right to a few millimetres. 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -46,6 +47,8 @@ ANCHOR_SIGMA_MM = 0.2
 """Standard deviation of nodes that other evidence has placed."""
 HALVINGS = 20
 """Steps by which nodes of elements that would turn over follow less; in the second half they stay where they are."""
+BESIDE_CUT_MM = 3.0
+"""A block about a place nearer to a cut than this is as much of the other piece, and is not followed."""
 APART_MM = 15.0
 """Blocks are held out by cubes this wide: they are dense, and what they tell does not reach far."""
 
@@ -64,7 +67,8 @@ class Compared:
 class Shape:
     """A lung in a scan. rest: undeformed, in the scan's frame; map: from the CT, with the same tetrahedra; anchors:
     (k,) nodes that other evidence has placed; within_mm: how deep below the pleura blocks are followed; wall: what its
-    surface touches in the scan, None where it need not touch anything.
+    surface touches in the scan, None where it need not touch anything; cut: distance (n,) mm of points (n, 3) of the CT
+    from a cut through the lung, None where there is none.
     """
 
     rest: TetMesh
@@ -72,6 +76,7 @@ class Shape:
     anchors: Array
     within_mm: float = float("inf")
     wall: SurfacePoints | None = None
+    cut: Callable[[Array], Array] | None = None
 
     def moved(self, points: Array) -> Shape:
         """The same lung with its nodes at points (n, 3) mm of the scan."""
@@ -115,6 +120,8 @@ def refine_by_blocks(compared: Compared, shape: Shape, settings: RefinementSetti
         matches = _blocks(around, starts, trial.map, voxel_mm, reach_mm)
         if np.isfinite(shape.within_mm):
             matches = matches.only(_depth(shape.map.mesh, matches.moving) <= shape.within_mm)
+        if shape.cut is not None:
+            matches = matches.only(np.abs(shape.cut(matches.moving)) >= BESIDE_CUT_MM)
         if too_few(matches):
             break
         hidden = held_out(matches.fixed, APART_MM)
