@@ -23,6 +23,8 @@ from poro.linalg.solver import elimination_tree, linear_solver
 from poro.mesh.tetmesh import TetMesh
 
 _MAX_NEWTON = 25  # steps for one share of the load
+_PATIENCE = 4  # where steps are counted: those without a smaller residual, after which the load is raised by less
+_FEWEST = 5  # Newton steps that a share of the load takes at best
 _SMALLEST_STEP = 1 / 64  # of the load
 _SHRINK, _MAX_HALVINGS = 0.5, 12
 _MAX_SETS = 15
@@ -85,16 +87,17 @@ class FiniteState:
 def deform(problem: FiniteProblem, tolerance: float = 1e-8, most_steps: float = np.inf) -> FiniteState:
     """Raise the load in steps, halved when Newton fails and doubled when it does not, until all of it is carried.
 
-    tolerance: relative residual of a balanced lung; most_steps: Newton steps in all, after which no further share of
-    the load is tried.
+    tolerance: relative residual of a balanced lung; most_steps: Newton steps in all; no further share of the load is
+    tried where they cannot carry the rest even at best.
     """
     contacts = 0 if problem.contact is None else len(problem.contact.nodes)
     u, force, active = np.zeros_like(problem.load), np.zeros(contacts), np.zeros(contacts, bool)
     share, step, taken = 0.0, 0.25, 0
+    patience = _PATIENCE if np.isfinite(most_steps) else _MAX_NEWTON
     residuals: list[float] = []
     while share < 1:
         step = min(step, 1 - share)
-        tried = _newton(problem, share, share + step, (u, force, active), residuals, tolerance)
+        tried = _newton(problem, share, share + step, (u, force, active), residuals, (tolerance, patience))
         if tried is not None:
             u, force, active = tried
             share, step, taken = share + step, 2 * step, taken + 1
@@ -102,11 +105,16 @@ def deform(problem: FiniteProblem, tolerance: float = 1e-8, most_steps: float = 
             step /= 2
             if step < _SMALLEST_STEP:
                 break
-        if len(residuals) >= most_steps:
+        if len(residuals) + _FEWEST * _shares_at_best(1 - share, step) > most_steps:
             break
     ended = FiniteStatus.STOPPED if step < _SMALLEST_STEP else FiniteStatus.OUT_OF_STEPS
     status = FiniteStatus.SOLVED if share >= 1 else ended
     return FiniteState(u, force, active, share, tuple(residuals), taken, status)
+
+
+def _shares_at_best(rest: float, step: float) -> int:
+    """How many steps carry the rest of a load where each is twice as large as the one before, the first of `step`."""
+    return int(np.ceil(np.log2(1 + rest / step) - 1e-9))
 
 
 def _gap(problem: FiniteProblem, u: Array, share: float) -> tuple[Array, Array, Array]:
@@ -139,14 +147,19 @@ def _newton(
     share: float,
     start: tuple[Array, Array, Array],
     residuals: list[float],
-    tolerance: float,
+    limits: tuple[float, int],
 ) -> tuple[Array, Array, Array] | None:
-    """Displacement, contact forces and active set that carry `share` of the load, from those at `before`, or None."""
+    """Displacement, contact forces and active set that carry `share` of the load, from those at `before`, or None.
+
+    limits: residual of a balanced lung, and how many steps in a row may bring no smaller one.
+    """
+    tolerance, patience = limits
     u, force, active = start
     load = share * problem.load
     jump = (share - before) * problem.imposed
     nodes = np.zeros(0, int) if problem.contact is None else problem.contact.nodes
-    last = np.inf
+    last = least = np.inf
+    in_vain = 0
     for _ in range(_MAX_NEWTON):
         _, stress, moduli = _respond(problem, deformation_gradient(problem.mesh, u), share)
         unbalanced = load - eigenstress_load(problem.mesh, stress)
@@ -184,6 +197,10 @@ def _newton(
         residuals.append(last)
         if last < tolerance and not behind.any() and length == 1:
             return u, force, active
+        in_vain = 0 if last < least else in_vain + 1
+        least = min(last, least)
+        if in_vain == patience:
+            return None
     return None
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -14,6 +16,7 @@ from poro.collapse import (
     Theta,
     assemble,
     choice,
+    finite_strain,
     hilum_modes,
     keep_in_range,
     solve,
@@ -143,3 +146,41 @@ def test_load_modes_are_refused(system: PoroSystem) -> None:
     )
     with pytest.raises(ValueError, match="no load modes"):
         finite_problem(with_modes, Theta(1e-9, 0.8, 0.0, (0.0,)), MATERIAL)
+
+
+def test_a_share_of_the_load_is_given_up_that_brings_nothing_and_the_rest_where_steps_are_short(
+    system: PoroSystem, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A lung under more than it can carry. Each try's residuals, and whether it balanced."""
+    tries: list[tuple[list[float], bool]] = []
+    newton = finite_strain._newton
+
+    def spied(
+        problem: FiniteProblem, before: float, share: float, start: Any, residuals: list[float], limits: Any
+    ) -> Any:
+        known = len(residuals)
+        found = newton(problem, before, share, start, residuals, limits)
+        tries.append((residuals[known:], found is not None))
+        return found
+
+    monkeypatch.setattr(finite_strain, "_newton", spied)
+    overloaded = finite_problem(system, Theta(1e-8, 0.5, 60.0), MATERIAL)
+    state = deform(overloaded, most_steps=60)
+    assert state.status is FiniteStatus.OUT_OF_STEPS
+    assert 0 < state.share < 1
+    failed = [each for each, balanced in tries if not balanced]
+    assert len(failed) >= 2
+    assert all(len(each) - 1 - int(np.argmin(each)) <= finite_strain._PATIENCE for each in failed)
+    assert any(len(each) < finite_strain._MAX_NEWTON for each in failed)
+    short = deform(overloaded, most_steps=20)  # 7 steps for the first quarter, 10 at best for two more shares
+    assert short.status is FiniteStatus.OUT_OF_STEPS
+    assert short.share == 0.25
+
+
+@pytest.mark.parametrize(
+    ("rest", "step", "shares"), [(0.75, 0.5, 2), (0.5, 0.5, 1), (0.5, 0.25, 2), (0.75, 0.25, 2), (0.0, 0.5, 0)]
+)
+def test_steps_that_double_carry_the_rest_of_a_load(rest: float, step: float, shares: int) -> None:
+    assert finite_strain._shares_at_best(rest, step) == shares
+    assert step * (2**shares - 1) >= rest
+    assert shares == 0 or step * (2 ** (shares - 1) - 1) < rest
