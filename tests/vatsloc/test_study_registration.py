@@ -12,11 +12,21 @@ from registration.images.interpolate import interpolate
 from registration.maps.field import DisplacementField
 from registration.maps.rigid import RigidTransform
 from registration.volume import Mask, Volume
+from vatsloc.evaluation.evaluate import errors_by_depth
 from vatsloc.study.bench import registration as bench
 from vatsloc.study.bench.cost_registration import Images, exponent
 from vatsloc.study.bench.elastix import ElastixSettings, elastix_version, run_elastix
 from vatsloc.study.bench.isolated import isolated
-from vatsloc.study.bench.registration import Ours, bench_registration, case_folder, page, score, table
+from vatsloc.study.bench.registration import (
+    Dense,
+    Ours,
+    bench_registration,
+    case_folder,
+    depth_table,
+    page,
+    score,
+    table,
+)
 from vatsloc.study.stability import registration as stability
 from vatsloc.study.stability.registration import Scene, make_pair
 from vatsloc.workflow.stages import quiet
@@ -48,6 +58,32 @@ def test_score_of_a_known_shift(images: Images) -> None:
     row = score(images, field := DisplacementField(shift, AFFINE), field)
     assert [row[key] for key in ("tre_mean", "tre_p95", "tre_max", "n")] == pytest.approx([4.0, 4.0, 4.0, 2])
     assert [row["min_det"], row["folded_share"]] == pytest.approx([1.0, 0.0])
+
+
+def test_score_tells_tissue_by_depth(images: Images) -> None:
+    """Two points each 2 and 7 mm deep, of which the first is found and the second is 4 mm off."""
+    fixed = np.array([[-20.0, -30.0, 20.0], [-40.0, -50.0, 40.0]])
+    dense = Dense(fixed, fixed + np.array([[3.0, 0, 0], [3.0, 4.0, 0]]), np.array([2.0, 7.0]))
+    field = DisplacementField(np.zeros((*images.fixed.hu.shape, 3)) + np.array([3.0, 0, 0]), AFFINE)
+    first, second, *rest = score(images, field, field, dense)["by_depth"]
+    assert (first["from_mm"], first["to_mm"], first["n"], first["mm"]["mean"]) == (0, 5, 1, pytest.approx(0, abs=1e-9))
+    assert (second["from_mm"], second["to_mm"], second["n"], second["mm"]["p95"]) == (5, 10, 1, pytest.approx(4.0))
+    assert all(told["mm"] is None for told in rest)
+
+
+def test_the_page_tells_ours_and_elastix_by_depth() -> None:
+    def classes(mm: float) -> list[dict[str, Any]]:
+        return errors_by_depth({"mm": np.full(3, mm)}, np.array([1.0, 6.0, 12.0]))
+
+    ours = {"by_depth": classes(1.5), "by_depth_whole": classes(0.9), "seconds": 3.0, "seconds_registered": 7.0}
+    peer = {"by_depth": classes(2.0), "seconds": 27.0}
+    rows = {"lung mask": peer}
+    told = depth_table([{"name": "one", "ours": ours, "elastix_rows": rows}])
+    assert "| case | program | 0-5 mm | 5-10 mm | 10-20 mm | s |" in told
+    assert "| one | ours, all of phase 1 | 0.90 / 0.90 | 0.90 / 0.90 | 0.90 / 0.90 | 7.0 |" in told
+    assert "| one | ours, free form | 1.50 / 1.50 | 1.50 / 1.50 | 1.50 / 1.50 | 3.0 |" in told
+    assert "| one | elastix, lung mask | 2.00 / 2.00 | 2.00 / 2.00 | 2.00 / 2.00 | 27.0 |" in told
+    assert depth_table([{"name": "one", "ours": {"by_depth_whole": []}, "elastix_rows": None}]) == ""
 
 
 def test_score_counts_the_folded_half(images: Images) -> None:
