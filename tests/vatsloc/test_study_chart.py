@@ -8,15 +8,12 @@ import re
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from poro.breathing.affine import affine_to_points
-from poro.fit import FitStatus
-from poro.mesh import TetMesh
 from registration.ffd import FfdSettings, Weights
 from registration.images.resample import resample
 from registration.maps.rigid import RigidTransform
@@ -24,16 +21,12 @@ from registration.sliding import LungImage
 from registration.volume import Mask, Volume
 from tests.vatsloc.browser import CHROMIUM, asked_by_the_page, visit
 from vatsloc.errors import CaseError, InputRefused
-from vatsloc.evaluation.tre import RunMaps
 from vatsloc.study.chart import chart
-from vatsloc.study.chart.chart import Row, append_row, measure_case, read_rows, run_chart
+from vatsloc.study.chart.chart import Row, append_row, read_rows, run_chart
 from vatsloc.study.chart.draw import MARK, NUMBER, interactive, places, require_matplotlib, write_chart
 from vatsloc.study.chart.points import dominating, points_of, told_of_presets
 from vatsloc.study.chart.tables import page
 from vatsloc.study.chart.variants import VARIANTS, chosen_variants, masked_only, plain
-from vatsloc.study.cohort import scored
-from vatsloc.workflow.choices import weigh
-from vatsloc.workflow.stages import Stages
 
 
 def row(variant: str, case: str, *numbers: float) -> Row:
@@ -137,118 +130,6 @@ def test_pairs_that_are_there_are_not_run_again(monkeypatch: pytest.MonkeyPatch,
     assert [(row.case, row.variant) for row in rows][-2:] == [("b", "balanced"), ("b", "rigid")]
     run_chart(cases, chosen_variants(["balanced", "rigid"]), tmp_path)
     assert len(ran) == 7
-
-
-MESH = TetMesh(60.0 * np.vstack([np.zeros(3), np.eye(3)]) - 10, np.array([[0, 1, 2, 3]]))
-CT = np.array([[2.0, 3.0, 4.0], [5.0, 1.0, 8.0]])
-MOVED = np.array([1.0, 2, 0])
-
-
-def test_a_case_s_rows_hold_the_errors_and_the_seconds_of_what_each_variant_needs(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    """The truth moves by (1, 0, 0) and then by (0, 2, 0); both phases find half of it."""
-
-    def took(stages: Stages, **seconds: float) -> None:
-        stages.seconds |= {name.replace("_", " "): s for name, s in seconds.items()}
-        stages.cpu_seconds |= {name: 10 * s for name, s in stages.seconds.items()}
-
-    def read(stages: Stages, **seconds: float) -> Any:
-        took(stages, **seconds)
-        return SimpleNamespace(lung_ct=SimpleNamespace(inside=None, ras_from_ijk=None))
-
-    def pose(_case: Any, _prepared: Any, settings: Any, stages: Stages, _register: Any) -> Any:
-        took(stages, spine_CT_to_inflated=0.5, rest=3.5)
-        shift = np.array([0.5, 0, 0]) if settings.registration.on else np.zeros(3)
-        return SimpleNamespace(
-            inf_from_ct_rigid=RigidTransform.identity(),
-            inf_from_ct=lambda points: points + shift,
-            mesh_inf=MESH,
-            mesh_ct=MESH,
-        )
-
-    def observe(_case: Any, _prepared: Any, _pose: Any, _settings: Any, stages: Stages) -> Any:
-        took(stages, spine_inflated_to_deflated=0.25)
-        return SimpleNamespace(def_from_inf_rigid=RigidTransform.identity())
-
-    def select(_gravity: Any, _prepared: Any, _observed: Any, settings: Any, stages: Stages) -> Any:
-        took(stages, fit=6.75)
-        stages.choose(weigh("residual registration", 0.5, 1.0, "seen"))
-        return FitStatus.CONVERGED if settings.model.hilum else FitStatus.CONTACT
-
-    def modelled(_prepared: Any, _pose: Any, _observed: Any, model: Any, _settings: Any, _stages: Stages) -> Any:
-        after = TetMesh(MESH.points + np.array([0, 1.0, 0]), MESH.tets)
-        rigid = RigidTransform.identity()
-        return SimpleNamespace(fit=SimpleNamespace(status=model), def_from_inf_rigid=rigid, mesh_after=after)
-
-    def refined(_case: Any, _prepared: Any, _pose: Any, collapse: Any, _settings: Any, stages: Stages) -> Any:
-        took(stages, block_refinement=1.0)
-        collapse.mesh_after = TetMesh(collapse.mesh_after.points + np.array([0, 0.5, 0]), MESH.tets)
-        return collapse
-
-    nodule = SimpleNamespace(centre_ras=CT[0])
-    landmarks = SimpleNamespace(ct=CT, inflated=CT + np.eye(3)[0], deflated=CT + MOVED)
-    dense = np.stack([CT, CT + np.eye(3)[0], CT + MOVED], axis=1)
-    everywhere = Mask(np.ones((3, 3, 3), dtype=bool), np.diag([40.0, 40, 40, 1]))
-    views = {"inflated": everywhere, "deflated": everywhere}
-    known = SimpleNamespace(nodule_deflated_ras=CT[0] + MOVED)
-    truth = SimpleNamespace(landmarks=landmarks, nodule=known, dense=dense, fields_of_view=views)
-    case = SimpleNamespace(nodule=nodule, gravity_ras=None, cbct_inflated="seen")
-    monkeypatch.setattr(chart, "read_case", lambda _folder: case)
-    monkeypatch.setattr(chart, "read_truth", lambda _folder: truth)
-    monkeypatch.setattr(
-        chart, "prepare_before", lambda _case, _scan, stages: read(stages, read=1.0, lungs=1.5, inflated=0.25)
-    )
-    monkeypatch.setattr(chart, "prepare", lambda _case, stages, _before: read(stages, deflated=0.25))
-    monkeypatch.setattr(scored, "stuff", lambda *_mesh: None)
-    monkeypatch.setattr(scored, "depth_below_pleura", lambda _mesh, points: np.array([4.0, 14.0])[: len(points)])
-    monkeypatch.setattr(chart, "change_of_pose", pose)
-    for step in (observe, modelled, refined):
-        monkeypatch.setattr(chart, step.__name__, step)
-    monkeypatch.setattr(chart, "in_pieces", lambda _prepared, pose, collapse, _settings, _stages: (pose, collapse))
-
-    def told(stages: Stages, seconds: float, moved: float) -> Any:
-        took(stages, localize=seconds)
-        still, along = RigidTransform.identity(), np.array([0, moved, 0])
-        return RunMaps(still, still, still, still, still, lambda points: points + MOVED - along)
-
-    def bare(_case: Any, _settings: Any, before: Stages, after: Stages) -> Any:
-        took(before, lungs=2.0)
-        return told(after, 9.0, 0.25)
-
-    monkeypatch.setattr(chart, "without_inflated", bare)
-    monkeypatch.setattr(chart, "foreseen", lambda _case, _prepared, stages: told(stages, 1.5, 4.0))
-    names = ["rigid", "ffd-16", "balanced", "alone", "no-hilum", "two-scans", "one-scan"]
-    chosen = {name: replace(variant, select=select) for name, variant in chosen_variants(names).items()}
-    rows = {row.variant: row for row in measure_case(tmp_path / "case", chosen)}
-    rigid, pose_only, balanced, alone, failed, two, one = (rows[name] for name in names)
-    assert (rigid.phase1_mean, rigid.phase2_mean) == (1, 2)
-    assert rigid.chain_mean == pytest.approx(math.sqrt(5))
-    assert (rigid.phase1_seconds, rigid.phase2_seconds) == (0.5, 0.25)
-    assert rigid.tissue_mean == pytest.approx(math.sqrt(5))
-    assert (pose_only.phase1_mean, pose_only.phase1_seconds) == (0.5, 4)  # without reading and preparing
-    assert math.isnan(pose_only.chain_mean)
-    assert (balanced.phase1_mean, balanced.phase2_mean, balanced.phase2_seconds) == (0.5, 0.5, 8)
-    assert balanced.chain_mean == pytest.approx(math.hypot(1, 0.5))
-    assert balanced.nodule_mm == pytest.approx(math.hypot(1, 0.5))
-    assert balanced.pleura_mean == pytest.approx(math.hypot(1, 0.5))
-    assert balanced.chain_seconds == pytest.approx(15, abs=0.1)
-    assert balanced.after_seconds == pytest.approx(8.25)  # the deflated scan and phase 2
-    assert balanced.left_out == "residual registration"
-    assert (alone.phase2_mean, alone.phase2_seconds) == (1, 7)  # without blocks
-    assert (rigid.phase2_cpu, balanced.phase2_cpu) == (2.5, 80)
-    assert (two.chain_mean, two.nodule_mm, two.pleura_mean) == (0.25, 0.25, 0.25)
-    assert (two.after_seconds, two.after_cpu) == (9, 90)
-    assert two.chain_seconds == pytest.approx(12, abs=0.1)  # reading and the CT's lungs before
-    assert math.isnan(two.phase1_mean)
-    assert (one.chain_mean, one.after_seconds) == (4, 1.5)
-    assert failed.failed == "the contact of the collapsing lung did not settle"
-
-
-def test_a_case_without_an_inflated_scan_is_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(chart, "read_case", lambda _folder: SimpleNamespace(cbct_inflated=None))
-    with pytest.raises(InputRefused, match="no inflated CBCT"):
-        next(measure_case(tmp_path, chosen_variants(["two-scans"])))
 
 
 def test_every_variant_s_settings_are_valid_and_unknown_names_are_refused() -> None:
