@@ -25,11 +25,11 @@ from vatsloc.workflow.fissures import Fissure, Parted, mapped, smooth_map
 from vatsloc.workflow.hold_out import held_out
 from vatsloc.workflow.model_selection import GAIN, Refinement, fit_settings, misfit
 from vatsloc.workflow.observe import Observed
-from vatsloc.workflow.parting import seen_fissure
 from vatsloc.workflow.pneumothorax import Collapse, residual_of_part
 from vatsloc.workflow.pose import ChangeOfPose
 from vatsloc.workflow.prepare import Prepared
 from vatsloc.workflow.residual import Residual
+from vatsloc.workflow.seen_fissure import seen_fissure
 from vatsloc.workflow.settings import Settings
 from vatsloc.workflow.stages import Stages
 

@@ -12,9 +12,9 @@ from registration.volume import Array
 from tests.vatsloc import run_scene as known
 from vatsloc.imaging.hilum import Hilum
 from vatsloc.imaging.surface import Border, SurfacePoints
-from vatsloc.workflow import parting as module
+from vatsloc.workflow import seen_fissure as module
 from vatsloc.workflow.fissures import Fissure, Sheet
-from vatsloc.workflow.parting import LEAST_CLEAR, _bare_mm, _bent, _came_from, _Seen, _seen, _sides, seen_fissure
+from vatsloc.workflow.seen_fissure import LEAST_CLEAR, _bare_mm, _bent, _came_from, _Seen, _seen, _sides, seen_fissure
 
 BEFORE_FROM_CT = known.as_affine(known.DEF_FROM_INF_RIGID) @ known.INF_FROM_CT
 APART = np.array([[9.0, 0, 6.0], [-9.0, 0, -6.0]])  # mm, of what lies above the fissure and below it
