@@ -93,6 +93,8 @@ def test_the_sheet_bends_to_the_fissure() -> None:
 def test_a_side_with_few_clear_keypoints_bends_nothing() -> None:
     found, _, _ = seen(2 * LEAST_CLEAR - 2)
     assert _bent(PLANE, found) is PLANE
+    high = replace(PLANE, shape=np.array([0.0, 0, -200, 0, 0, 0]))  # all keypoints lie below
+    assert not _sides(high, found)[0].any()
 
 
 def test_the_piece_that_is_told_less_says_how_far_half_of_it_lies_from_its_own_keypoints() -> None:

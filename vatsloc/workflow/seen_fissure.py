@@ -51,7 +51,7 @@ class _Seen:
 
     def in_ct(self, points: Array) -> Array:
         """Where points (q, 3) mm of the lung before its collapse lie in the CT."""
-        return interpolate(locate(self.collapse.mesh_before, points), self.pose.mesh_ct.points)
+        return _in_ct(self.pose, self.collapse, points)
 
     def deep(self, in_ct: Array) -> Array:
         """Points (q, 3) mm of the CT that lie deep below the pleura."""
@@ -75,8 +75,12 @@ def seen_fissure(pose: ChangeOfPose, collapse: Collapse) -> Fissure | None:
 
 def _seen(pose: ChangeOfPose, collapse: Collapse) -> _Seen:
     observed, moving = collapse.observed, collapse.model.correspondences.moving
-    seen = _Seen(pose, collapse, moving, moving, observed.surface.only(Border.AIR, Border.FISSURE).points)
-    return replace(seen, points=seen.in_ct(moving), hilum=seen.in_ct(observed.hilum.point_ras[None])[0])
+    points, hilum = (_in_ct(pose, collapse, x) for x in (moving, observed.hilum.point_ras[None]))
+    return _Seen(pose, collapse, points, hilum[0], observed.surface.only(Border.AIR, Border.FISSURE).points)
+
+
+def _in_ct(pose: ChangeOfPose, collapse: Collapse, points: Array) -> Array:
+    return interpolate(locate(collapse.mesh_before, points), pose.mesh_ct.points)
 
 
 def _bent(sheet: Sheet, seen: _Seen) -> Sheet:
@@ -104,9 +108,13 @@ def _bare_mm(sheet: Sheet, seen: _Seen) -> float:
 
 
 def _sides(sheet: Sheet, seen: _Seen) -> tuple[Array, Array]:
-    """Which keypoints (n,) clearly move with one side of a sheet, and with which (n,), +1 or -1."""
+    """Which keypoints (n,) clearly move with one side of a sheet, and with which (n,), +1 or -1; none where a side has
+    too few to tell how it moved.
+    """
     at = seen.points - seen.hilum
     above = sheet.distance(seen.points) > 0
+    if min(above.sum(), (~above).sum()) < LEAST_CLEAR:
+        return np.zeros(len(at), dtype=bool), np.where(above, 1, -1)
     upper, lower = (
         np.linalg.norm(mapped(smooth_map(at[mine], seen.motion[mine]), at) - seen.motion, axis=1)
         for mine in (above, ~above)
