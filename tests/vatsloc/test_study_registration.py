@@ -78,12 +78,14 @@ def test_the_page_tells_ours_and_elastix_by_depth() -> None:
     ours = {"by_depth": classes(1.5), "by_depth_whole": classes(0.9), "seconds": 3.0, "seconds_registered": 7.0}
     peer = {"by_depth": classes(2.0), "seconds": 27.0}
     rows = {"lung mask": peer}
-    told = depth_table([{"name": "one", "ours": ours, "elastix_rows": rows}])
+    bare = {"name": "bare", "ours": {"by_depth_whole": []}, "elastix_rows": None}  # no dense truth
+    told = depth_table([{"name": "one", "ours": ours, "elastix_rows": rows}, bare])
     assert "| case | program | 0-5 mm | 5-10 mm | 10-20 mm | s |" in told
     assert "| one | ours, all of phase 1 | 0.90 / 0.90 | 0.90 / 0.90 | 0.90 / 0.90 | 7.0 |" in told
     assert "| one | ours, free form | 1.50 / 1.50 | 1.50 / 1.50 | 1.50 / 1.50 | 3.0 |" in told
     assert "| one | elastix, lung mask | 2.00 / 2.00 | 2.00 / 2.00 | 2.00 / 2.00 | 27.0 |" in told
-    assert depth_table([{"name": "one", "ours": {"by_depth_whole": []}, "elastix_rows": None}]) == ""
+    assert "bare" not in told
+    assert depth_table([bare]) == ""
 
 
 def test_score_counts_the_folded_half(images: Images) -> None:

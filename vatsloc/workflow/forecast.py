@@ -17,7 +17,7 @@ from typing import Any, Literal
 import numpy as np
 from scipy import stats
 
-from registration.volume import Array
+from registration.volume import Array, Mask
 from vatsloc.formats.casefile import PleuralGas
 from vatsloc.frames import Side
 
@@ -95,6 +95,11 @@ def _by_anatomy(motions: Motions, about: Array) -> list[Array]:
     """What the persons of every kind of anatomy say, (m, 3) mm each, of a place (3,) mm about the middle."""
     guesses = motions.shift + motions.gradient @ about
     return [guesses[motions.anatomy == kind] for kind in np.unique(motions.anatomy)]
+
+
+def middle_of(lung: Mask) -> Array:
+    """Middle (3,) RAS mm of a lung, about which motions are told."""
+    return lung.grid.to_ras(np.argwhere(lung.inside).mean(axis=0))
 
 
 def mirrored(side: Side) -> Array:

@@ -17,7 +17,7 @@ from vatsloc.report.data import LUNG, SURFACE, Nodule, Outline, Picture
 from vatsloc.report.render import write_forecast
 from vatsloc.report.words import WORDS
 from vatsloc.results import REPORT
-from vatsloc.workflow.forecast import Forecast, calibrated_motions, forecast
+from vatsloc.workflow.forecast import Forecast, calibrated_motions, forecast, middle_of
 from vatsloc.workflow.prepare import prepare_lungs
 from vatsloc.workflow.stages import Say, Stages, quiet
 
@@ -42,7 +42,7 @@ def foresee_case(folder: Path, out: Path, say: Say = quiet) -> dict[str, Any]:
             stages.warn(sentence)
         lungs = prepare_lungs(case, stages)
         lung = lungs.of(case.side)
-        middle = lung.grid.to_ras(np.argwhere(lung.inside).mean(axis=0))
+        middle = middle_of(lung)
         motions = calibrated_motions("deflated")
         found = forecast(case.nodule.centre_ras, middle, case.side, motions, case.pleural_gas)
         stages.warn(IS_FORECAST)

@@ -17,7 +17,7 @@ from registration.volume import Array, Grid, Mask, Volume
 from vatsloc.case import CaseBefore
 from vatsloc.imaging.cbct import Cupping, FieldOfView, PreparedCbct, tissue_hu
 from vatsloc.maps import MeshMap, covered, sampled
-from vatsloc.workflow.forecast import calibrated_motions, mean_motion
+from vatsloc.workflow.forecast import calibrated_motions, mean_motion, middle_of
 from vatsloc.workflow.pose import ChangeOfPose
 from vatsloc.workflow.prepare import PreparedBefore, PreparedCt
 from vatsloc.workflow.settings import Settings
@@ -40,7 +40,7 @@ def stand_in(
     """What a run needs of an inflated scan and of the change of pose, expected instead of seen, in the CT's frame."""
     with stages.stage(EXPECTED, CT):
         mesh = stuff(ct.lung_ct.inside, ct.lung_ct.ras_from_ijk, settings.mesh.edge_mm)
-        middle = ct.lung_ct.grid.to_ras(np.argwhere(ct.lung_ct.inside).mean(axis=0))
+        middle = middle_of(ct.lung_ct)
         motion = mean_motion(mesh.points, middle, case.side, calibrated_motions("inflated"))
         pose = expected_pose(mesh, mesh.points + motion, ct.lung_ct.grid)
         image = as_scan(moved_ct(case.ct, pose.inf_from_ct, pose.lung_inf.grid))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from statistics import median
 from tempfile import TemporaryDirectory
@@ -15,7 +16,7 @@ from registration.images.resample import coarsen, resample_mask
 from registration.maps.field import DisplacementField, PointMap, compose
 from registration.volume import Array, Grid, Volume
 from vatsloc.case import read_case
-from vatsloc.evaluation.evaluate import errors_by_depth
+from vatsloc.evaluation.evaluate import DENSE_DEPTHS_MM, errors_by_depth
 from vatsloc.evaluation.inputs import Truth, depth_below_pleura, read_truth, seen_in
 from vatsloc.evaluation.statistics import distances, summarize
 from vatsloc.study.bench.cost_registration import Images, measure_cost
@@ -32,6 +33,8 @@ PHANTOMS = (Path("small-right:11"), Path("left:12"), Path("high-diaphragm:13"))
 
 ROUNDS = 2
 PEER_VOXEL_MM = 1.5
+SHOWN = tuple(pairwise(DENSE_DEPTHS_MM))[:3]
+"""Classes of depth that are shown: deeper in there is texture, and landmarks tell."""
 SPINE, FREE_FORM = "spine CT to inflated", "free-form deformation"
 
 
@@ -232,10 +235,6 @@ def page(result: dict[str, Any]) -> str:
     return "\n".join(lines) + "\n" + depth_table(result["cases"])
 
 
-DEPTHS = 3
-"""Classes of depth that are shown: deeper in there is texture, and landmarks tell."""
-
-
 def depth_table(cases: Sequence[dict[str, Any]]) -> str:
     """Errors by depth below the pleura as a Markdown table; empty without dense truth."""
     lines: list[str] = []
@@ -247,16 +246,16 @@ def depth_table(cases: Sequence[dict[str, Any]]) -> str:
         rows = {"ours, all of phase 1": (classes, seconds), "ours, free form": (ours["by_depth"], ours["seconds"])}
         rows |= {f"elastix, {n}": (r["by_depth"], r["seconds"]) for n, r in (case["elastix_rows"] or {}).items()}
         for program, (told, took) in rows.items():
-            cells = [_mean_and_95(one["mm"]) for one in told[:DEPTHS]]
+            cells = [_mean_and_95(one["mm"]) for one in told[: len(SHOWN)]]
             lines.append(f"| {case['name']} | {program} | {' | '.join(cells)} | {took:.1f} |")
     if not lines:
         return ""
-    head = " | ".join(f"{told['from_mm']:g}-{told['to_mm']:g} mm" for told in classes[:DEPTHS])
+    head = " | ".join(f"{low:g}-{high:g} mm" for low, high in SHOWN)
     return "\n".join(
         [
             "\nTissue in view by its depth below the pleura, mean / 95 % mm; seconds after the rigid pose:\n",
             f"| case | program | {head} | s |",
-            "|---" * (DEPTHS + 3) + "|",
+            "|---" * (len(SHOWN) + 3) + "|",
             *lines,
             "",
         ]

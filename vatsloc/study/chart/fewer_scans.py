@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
-
 from registration.maps.rigid import RigidTransform
 from registration.volume import Array
 from vatsloc.case import Case
 from vatsloc.evaluation.tre import RunMaps
 from vatsloc.study.cohort.scored import run_maps
-from vatsloc.workflow.forecast import calibrated_motions, mean_motion
+from vatsloc.workflow.forecast import calibrated_motions, mean_motion, middle_of
 from vatsloc.workflow.localize import localize
 from vatsloc.workflow.observe import spine_from_ct
 from vatsloc.workflow.prepare import Prepared, prepare_lungs
@@ -34,7 +32,7 @@ def foreseen(case: Case, prepared: Prepared, stages: Stages) -> RunMaps:
     taken from the deflated scan, by which it is only scored. Raises as `localize`.
     """
     lung = prepare_lungs(case, stages).of(case.side)
-    middle = lung.grid.to_ras(np.argwhere(lung.inside).mean(axis=0))
+    middle = middle_of(lung)
     persons = calibrated_motions("deflated")
     motions = persons.only(persons.gas == case.pleural_gas)
     rigid = spine_from_ct(case, prepared, Stages()).moving_from_fixed.inverse()
