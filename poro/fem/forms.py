@@ -22,6 +22,7 @@ from skfem.helpers import ddot, div, dot, grad, sym_grad
 from poro.arrays import Array
 from poro.mesh.tetmesh import TetMesh
 
+KEPT_MESHES = 3  # of a run that works on a fine mesh and a coarse one, and makes a fine one ready beside them
 CONSTANT, QUADRATIC = 1, 2  # degree of the polynomials that the quadrature integrates exactly
 
 
@@ -70,13 +71,13 @@ def _skfem(mesh: TetMesh) -> MeshTet:
 
 
 def stiffness(mesh: TetMesh, lame_kpa: float, shear_kpa: float) -> csr_matrix:
-    """Matrix (3n, 3n) kPa mm of `elasticity`. The last one is kept, since an elastic correction or a continuation
+    """Matrix (3n, 3n) kPa mm of `elasticity`. The last few are kept, since an elastic correction or a continuation
     solves with the same one again and again; add to it, never change it.
     """
     return _stiffness(mesh, float(lame_kpa), float(shear_kpa))
 
 
-@lru_cache(maxsize=1)
+@lru_cache(maxsize=KEPT_MESHES)
 def _stiffness(mesh: TetMesh, lame_kpa: float, shear_kpa: float) -> csr_matrix:
     local = elasticity.coo_data(vector_basis(mesh), lame=lame_kpa, shear=shear_kpa).data
     return _sum_blocks(mesh, local.reshape(4, 3, 4, 3, -1))

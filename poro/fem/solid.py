@@ -9,7 +9,7 @@ import numpy as np
 from scipy.sparse import csr_matrix
 
 from poro.arrays import Array
-from poro.fem.forms import stiffness
+from poro.fem.forms import KEPT_MESHES, stiffness
 from poro.fem.tissue import Tissue
 from poro.linalg.dissection import Tree
 from poro.linalg.solver import LinearSolver, elimination_tree, linear_solver, solve_once
@@ -77,7 +77,12 @@ def constrained(mesh: TetMesh, tissue: Tissue, constraints: csr_matrix, force: A
     return solve_once(matrix, mesh.points, force.ravel(), _tree(mesh, tissue)).reshape(-1, 3)
 
 
-@lru_cache(maxsize=1)
+def prepare_solid(mesh: TetMesh, tissue: Tissue) -> None:
+    """Do and keep what `constrained` needs of a mesh and a tissue alone, so that it need not be waited for."""
+    _tree(mesh, tissue)
+
+
+@lru_cache(maxsize=KEPT_MESHES)
 def _tree(mesh: TetMesh, tissue: Tissue) -> Tree:
     """The stiffness alone tells it: a point constraint couples only what its tetrahedron does."""
     return elimination_tree(stiffness(mesh, tissue.lame_kpa, tissue.shear_kpa), mesh.points)

@@ -25,11 +25,11 @@ def in_parts(work: Callable[[int, int], object], n: int, least: int = 1) -> None
     Every index has to be independent of all others, so that parts and threads do not show in the result. Raises what
     `work` raises.
     """
-    threads = get_num_threads()
-    parts = min(n, threads * PARTS_A_THREAD)
-    if threads == 1 or parts < 2 or n < least:
+    threads = 1 if n < max(least, 2) else get_num_threads()  # which takes as long as a small kernel
+    if threads == 1:
         work(0, n)
         return
+    parts = min(n, threads * PARTS_A_THREAD)
     list(_pool(os.getpid(), threads).map(lambda c: work(n * c // parts, n * (c + 1) // parts), range(parts)))
 
 

@@ -17,7 +17,7 @@ from registration.correspondences import Correspondences
 from registration.images.filters import gaussian
 from registration.keypoints.affine_matching import MaskedImage, match_affine_blocks
 from registration.keypoints.matching import moves_with_neighbours
-from registration.volume import Array, Mask, Volume
+from registration.volume import Array, Grid, Mask, Volume
 
 BLUR_VOXELS = 0.5
 CONTINUED_VOXELS = 1.0
@@ -49,42 +49,48 @@ class AlignedSettings:
     outlier_mm: float = 4.0
 
 
-class Regions(NamedTuple):
-    """Where the fixed and the moving image show the organ, each on its image's grid."""
+class Organ(NamedTuple):
+    """An organ in an image, made ready for matching by `organ_of`."""
 
-    fixed: Mask
-    moving: Mask
+    grid: Grid
+    image: MaskedImage
+
+
+def organ_of(image: Volume, region: Mask) -> Organ:
+    """The image blurred as all blocks are, by what lies in the region alone, which a border of two voxels continues: no
+    grey value from beyond the region enters a block, whether by blurring or between voxels.
+
+    Raises ValueError where image and region lie on different grids.
+    """
+    if not image.grid.same_as(region.grid):
+        raise ValueError(f"the region must lie on the image's grid: {region!r} against {image!r}; resample it first")
+    inside = region.inside.astype(np.float32)
+    known = image.hu * inside
+    fine, wide = (
+        gaussian(known, sigma, truncate=3.0) / np.maximum(gaussian(inside, sigma, truncate=3.0), 1e-6)
+        for sigma in (BLUR_VOXELS, CONTINUED_VOXELS)
+    )
+    return Organ(image.grid, MaskedImage(np.where(region.inside, fine, wide).astype(np.float32), region.inside))
 
 
 def match_aligned(
-    fixed: Volume,
-    moving: Volume,
-    regions: Regions,
-    points: Array,
-    moving_from_fixed: LinearizedMap,
-    settings: AlignedSettings,
+    fixed: Organ, moving: Organ, points: Array, moving_from_fixed: LinearizedMap, settings: AlignedSettings
 ) -> Correspondences:
     """Where the moving image shows the tissue about points (n, 3) RAS mm of the fixed one, for those that are found.
 
-    fixed: with cubic voxels; points are moved to the nearest voxel. moving_from_fixed: what aligns the images. Raises
-    ValueError where an image and its region lie on different grids.
+    fixed: with cubic voxels; points are moved to the nearest voxel. moving_from_fixed: what aligns the images.
     """
-    for image, region in ((fixed, regions.fixed), (moving, regions.moving)):
-        if not image.grid.same_as(region.grid):
-            raise ValueError(
-                f"the region must lie on the image's grid: {region!r} against {image!r}; resample it first"
-            )
     starts = np.unique(np.rint(fixed.grid.to_ijk(points)).astype(np.int64), axis=0)
     at = fixed.grid.to_ras(starts.astype(float))
     expected = moving_from_fixed(at)
-    per_voxel = expected.gradients @ fixed.ras_from_ijk[:3, :3]
+    per_voxel = expected.gradients @ fixed.grid.ras_from_ijk[:3, :3]
     affines = np.concatenate(
         [moving.grid.ijk_from_ras[:3, :3] @ per_voxel, moving.grid.to_ijk(expected.values)[:, :, None]], axis=2
     )
     voxel = float(fixed.grid.spacing.mean())
     found = match_affine_blocks(
-        _within(fixed, regions.fixed),
-        _within(moving, regions.moving),
+        fixed.image,
+        moving.image,
         starts,
         affines,
         round(settings.reach_mm / voxel),
@@ -93,18 +99,5 @@ def match_aligned(
     holds = (found.ncc >= settings.least_ncc) & (found.round_trip * voxel <= settings.round_trip_mm)
     moved = expected.values + np.einsum("nij,nj->ni", per_voxel, found.shift)
     matches = Correspondences.of(at[holds], moved[holds], found.ncc[holds])
-    off = found.shift[holds] @ fixed.ras_from_ijk[:3, :3].T
+    off = found.shift[holds] @ fixed.grid.ras_from_ijk[:3, :3].T
     return matches.only(moves_with_neighbours(matches.fixed, off, settings.neighbours, settings.outlier_mm))
-
-
-def _within(image: Volume, region: Mask) -> MaskedImage:
-    """The image blurred as all blocks are, by what lies in the region alone, which a border of two voxels continues: no
-    grey value from beyond the region enters a block, whether by blurring or between voxels.
-    """
-    inside = region.inside.astype(np.float32)
-    known = image.hu * inside
-    fine, wide = (
-        gaussian(known, sigma, truncate=3.0) / np.maximum(gaussian(inside, sigma, truncate=3.0), 1e-6)
-        for sigma in (BLUR_VOXELS, CONTINUED_VOXELS)
-    )
-    return MaskedImage(np.where(region.inside, fine, wide).astype(np.float32), region.inside)

@@ -86,11 +86,15 @@ class Parts:
             self.asked.append(values)
             return images
 
-        def refine(compared: Compared, shape: Shape, chosen: RefinementSettings) -> BlockRefinement:
+        def ready(compared: Compared, chosen: RefinementSettings) -> Compared:
             assert chosen == settings.refinement
+            return compared
+
+        def refine(compared: Compared, shape: Shape) -> BlockRefinement:
             self.refined.append((compared, shape))
             return BlockRefinement(shape.map.moved + self.off, ())
 
+        monkeypatch.setattr(module, "prospect", ready)
         monkeypatch.setattr(module, "refine_by_blocks", refine)
         monkeypatch.setattr(module, "select_model", select_model)
         monkeypatch.setattr(module, "residual_registration", correct)
@@ -231,8 +235,14 @@ def test_a_collapse_shows_its_parts(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_the_collapse_is_made_of_what_was_observed(monkeypatch: pytest.MonkeyPatch) -> None:
-    words: Any = [object() for _ in range(5)]
+    words = tuple(object() for _ in range(3))
+    settings, stages = settings_of("balanced"), Stages()
     monkeypatch.setattr(module, "observe", lambda *values: ("observed", *values))
     monkeypatch.setattr(module, "collapse", lambda *values: values)
-    case, prepared, pose, settings, stages = words
-    assert pneumothorax(*words) == (case, prepared, pose, ("observed", *words, None), settings, stages)
+    monkeypatch.setattr(module, "_prospect", lambda *values: values)
+    observed = ("observed", *words, settings, stages, None)
+    with stages.beside():
+        given: Any = words
+        assert pneumothorax(*given, settings, stages) == (*words, observed, settings, stages)
+        with stages.stage(REFINEMENT):
+            assert stages.done(lambda: None) == (*words[:2], observed, settings)

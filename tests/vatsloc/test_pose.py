@@ -58,11 +58,12 @@ class Watched:
         self.case: Any = SimpleNamespace(ct=scene.ct(), side="right", hints=hints)
         self.prior, self.lung_inf = object(), scene.empty(scene.inflated())
         self.fit: Any = scene.sliding_fit(50, 0.0, moved_back)
-        self.off = np.zeros(3)
+        self.off, self.prospect = np.zeros(3), object()
         for name, answer in (
             ("register_spine", scene.rigid_fit(CT_FROM_INF)),
             ("carry_prior", self.prior),
             ("inflated_lung", self.lung_inf),
+            ("prospect", self.prospect),
         ):
             monkeypatch.setattr(module, name, self._asked(name, answer))
 
@@ -158,7 +159,9 @@ def test_seen_nodes_go_where_the_inverted_field_says_and_the_others_go_on_smooth
 def test_blocks_near_the_pleura_refine_the_pose_and_deep_seen_nodes_stay(watched: Watched) -> None:
     watched.off = np.array([0.5, 1.0, -2.0])
     found = watched.run()
-    compared, shape, settings = watched.asked["refine_by_blocks"]
+    compared, settings, _ = watched.asked["prospect"]
+    prospect, shape = watched.asked["refine_by_blocks"]
+    assert prospect is watched.prospect
     assert (compared.ct, compared.lung_ct) == (watched.case.ct, watched.prepared.lung_ct)
     assert (compared.scan, compared.lung) == (watched.prepared.inflated, watched.lung_inf)
     assert_allclose(shape.rest.points, scene.INF_FROM_CT(found.mesh_ct.points))
@@ -175,7 +178,7 @@ def test_blocks_near_the_pleura_refine_the_pose_and_deep_seen_nodes_stay(watched
 def test_without_the_refinement_the_pose_is_the_registrations(watched: Watched) -> None:
     found = watched.run(refinement={"on": False})
     assert found.refinement is None
-    assert "refine_by_blocks" not in watched.asked
+    assert not {"prospect", "refine_by_blocks"} & set(watched.asked)
     assert watched.stages.skipped["block refinement, inflated"] == "switched off in the settings"
 
 

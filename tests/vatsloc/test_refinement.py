@@ -16,7 +16,7 @@ from tests.vatsloc import ball_scene as scene
 from vatsloc.imaging.surface import Border, SurfacePoints
 from vatsloc.maps import MeshMap
 from vatsloc.workflow import refinement as module
-from vatsloc.workflow.refinement import Compared, Shape, refine_by_blocks
+from vatsloc.workflow.refinement import Compared, Shape, prospect, refine_by_blocks
 from vatsloc.workflow.settings import RefinementSettings
 
 AROUND = scene.DEF_FROM_INF @ scene.INF_FROM_CT
@@ -49,7 +49,7 @@ def compared(**other: Any) -> Compared:
 
 
 def test_the_lung_follows_blocks_up_to_the_pleura() -> None:
-    found = refine_by_blocks(compared(), Lung.shape(np.zeros(0, int)), ON)
+    found = refine_by_blocks(prospect(compared(), ON), Lung.shape(np.zeros(0, int)))
     before, after = Lung.error(Lung.start), Lung.error(found.points)
     shallow = Lung.depth < 8.0
     assert before[shallow].mean() > 1.8
@@ -101,8 +101,8 @@ def test_without_a_wall_in_reach_nothing_is_drawn() -> None:
 def test_the_wall_brings_the_surface_nearer_than_blocks_alone() -> None:
     border = TetMesh(Lung.truth, Lung.mesh.tets).boundary
     shape = Lung.shape(np.zeros(0, int))
-    alone = refine_by_blocks(compared(), shape, ON)
-    held = refine_by_blocks(compared(), replace(shape, wall=wall_of(border.points, border.node_normals)), ON)
+    alone = refine_by_blocks(prospect(compared(), ON), shape)
+    held = refine_by_blocks(prospect(compared(), ON), replace(shape, wall=wall_of(border.points, border.node_normals)))
 
     def off_surface(points: Array) -> float:
         return float(np.abs(((points - Lung.truth)[border.nodes] * border.node_normals).sum(axis=1)).mean())
@@ -113,8 +113,8 @@ def test_the_wall_brings_the_surface_nearer_than_blocks_alone() -> None:
 
 def test_anchors_stay_and_deep_blocks_are_left_out() -> None:
     anchors = np.flatnonzero(Lung.depth > 16.0)
-    found = refine_by_blocks(compared(), Lung.shape(anchors, 16.0), ON)
-    everywhere = refine_by_blocks(compared(), Lung.shape(np.zeros(0, int)), ON)
+    found = refine_by_blocks(prospect(compared(), ON), Lung.shape(anchors, 16.0))
+    everywhere = refine_by_blocks(prospect(compared(), ON), Lung.shape(np.zeros(0, int)))
     assert found.passes[0].blocks < 0.9 * everywhere.passes[0].blocks
     assert Lung.error(found.points)[anchors].max() < 0.15 < Lung.error(everywhere.points)[anchors].max()
     assert Lung.error(found.points)[Lung.depth < 8.0].mean() < 0.6 * Lung.error(Lung.start)[Lung.depth < 8.0].mean()
@@ -124,8 +124,8 @@ def test_blocks_about_a_cut_are_not_followed() -> None:
     def above(points: Array) -> Array:
         return np.asarray((points - scene.CENTRE_CT)[:, 2] - 7.0)
 
-    uncut = refine_by_blocks(compared(), Lung.shape(np.zeros(0, int)), ON)
-    cut = refine_by_blocks(compared(), replace(Lung.shape(np.zeros(0, int)), cut=above), ON)
+    uncut = refine_by_blocks(prospect(compared(), ON), Lung.shape(np.zeros(0, int)))
+    cut = refine_by_blocks(prospect(compared(), ON), replace(Lung.shape(np.zeros(0, int)), cut=above))
     assert uncut.followed is not None
     assert cut.followed is not None
     assert (np.abs(above(uncut.followed.moving)) < module.BESIDE_CUT_MM).sum() > 20
@@ -138,8 +138,10 @@ def test_of_the_scan_s_points_those_are_followed_that_lie_near_the_pleura_before
     """Points of tissue are taken back to the CT, where the lung is a ball, by maps in closed form."""
     within = 8.0
     mapped = MeshMap(Lung.mesh, Lung.truth, AROUND)
+    everywhere = prospect(compared(), ON.model_copy(update={"cell_mm": 8.0})).points
     points, chosen = (
-        module._starts(compared(), Shape(Lung.rest, mapped, np.zeros(0, int), reach), 8.0) for reach in (np.inf, within)
+        module._within_reach(everywhere, Shape(Lung.rest, mapped, np.zeros(0, int), reach))
+        for reach in (np.inf, within)
     )
     before = AROUND.inverse()(scene.expanded(points))
     depth = scene.RADIUS_MM - np.linalg.norm(before - scene.CENTRE_CT, axis=1)
@@ -154,13 +156,13 @@ def test_a_lung_that_is_right_is_left_as_it_is(monkeypatch: pytest.MonkeyPatch) 
     """Blocks that scatter about the truth predict those held out no better than the truth does."""
     rng = np.random.default_rng(0)
 
-    def scattered(_around: Any, _starts: Any, to_scan: MeshMap, *_rest: Any) -> Correspondences:
+    def scattered(*_asked: Any) -> Correspondences:
         ct = scene.CENTRE_CT + rng.uniform(-22, 22, (400, 3))
-        return Correspondences.of(to_scan(ct) + rng.normal(size=(400, 3)), ct)
+        return Correspondences.of(shape.map(ct) + rng.normal(size=(400, 3)), ct)
 
-    monkeypatch.setattr(module, "_blocks", scattered)
+    monkeypatch.setattr(module, "match_aligned", scattered)
     shape = Shape(Lung.rest, MeshMap(Lung.mesh, Lung.truth, AROUND), np.zeros(0, int))
-    found = refine_by_blocks(compared(), shape, ON)
+    found = refine_by_blocks(prospect(compared(), ON), shape)
     assert [one.kept for one in found.passes] == [False, False]
     assert all(one.blocks == 400 and one.after_mm >= one.before_mm for one in found.passes)
     assert_array_equal(found.points, Lung.truth)
@@ -172,7 +174,9 @@ def test_where_too_few_blocks_are_found_nothing_moves(lost: str) -> None:
     inside = np.zeros_like(mask.inside)
     if lost == "lung_ct":
         inside[tuple(np.argwhere(mask.inside)[0])] = True
-    found = refine_by_blocks(compared(**{lost: Mask(inside, mask.ras_from_ijk)}), Lung.shape(np.zeros(0, int)), ON)
+    found = refine_by_blocks(
+        prospect(compared(**{lost: Mask(inside, mask.ras_from_ijk)}), ON), Lung.shape(np.zeros(0, int))
+    )
     assert found.passes == ()
     assert_array_equal(found.points, Lung.start)
 

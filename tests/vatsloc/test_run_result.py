@@ -11,16 +11,17 @@ from numpy.testing import assert_allclose, assert_array_equal
 from poro.mesh import TetMesh
 from registration.volume import Array, Grid
 from tests.vatsloc import run_scene as known
+from vatsloc.case import Case
 from vatsloc.maps import covered
 from vatsloc.report.data import LUNG, SURFACE
 from vatsloc.results import ResultData
 from vatsloc.workflow.choices import Choice
-from vatsloc.workflow.fields import fields_of
+from vatsloc.workflow.fields import Carried
 from vatsloc.workflow.gates import Gate
 from vatsloc.workflow.localization import Localization
 from vatsloc.workflow.model_selection import Refinement
-from vatsloc.workflow.run import _nodule_mask, _pictures, _record, _residuals, _result
-from vatsloc.workflow.settings import Settings
+from vatsloc.workflow.run import _in_deflated, _in_inflated, _nodule_mask, _pictures, _record, _residuals, _result
+from vatsloc.workflow.settings import Settings, settings_of
 from vatsloc.workflow.stages import Stages
 
 AXES = np.array([[0.6, 0.8, 0], [0, 0, 1.0], [0.8, -0.6, 0]])
@@ -43,7 +44,14 @@ def found() -> Localization:
 @pytest.fixture(scope="module")
 def result(found: Localization) -> ResultData:
     case = known.scene().case
-    return _result(case, found, fields_of(case, found, 0.0), _record(case, found, Settings(), stages()))
+    return _result(case, found, *both_scans(case, found, 0.0), _record(case, found, Settings(), stages()))
+
+
+def both_scans(case: Case, found: Localization, field_mm: float) -> tuple[Carried, Carried]:
+    """What a run makes of the inflated and of the deflated scan, fields on voxels `field_mm` apart."""
+    settings = settings_of("balanced", {"output": {"field_mm": field_mm}})
+    assert case.cbct_inflated is not None
+    return _in_inflated(case, case.cbct_inflated, found, settings), _in_deflated(case, found, settings)
 
 
 def stages() -> Stages:

@@ -28,6 +28,7 @@ VOXEL_MM, MAP_MM = 2.0, 4.0
 RIM_MM = 3.0
 """So far from the lung's border an image shows what lies beyond."""
 MARGIN_MM = 40.0
+CHECK = "check"
 
 
 @dataclass(frozen=True)

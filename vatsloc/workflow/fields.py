@@ -10,7 +10,6 @@ import numpy as np
 from registration.images.resample import resample
 from registration.maps.field import DisplacementField
 from registration.volume import Array, Grid, Mask, Volume
-from vatsloc.case import Case
 from vatsloc.maps import MeshMap, box_of, sampled
 from vatsloc.workflow.localization import Localization
 
@@ -18,31 +17,25 @@ MARGIN_MM = 10.0
 
 
 @dataclass(frozen=True)
-class Fields:
-    """The run's maps: from the CT on the lung's box, to the CT on the grids of the cone-beam CTs; None of a scan that
-    was not taken.
+class Carried:
+    """What a map from the CT to a scan makes for viewers. ct: the CT as the scan should show it; from_ct: the map on
+    the lung's box in the CT; to_ct: its inverse on the scan's grid.
     """
 
-    inflated_from_ct: DisplacementField | None
-    deflated_from_ct: DisplacementField
-    ct_from_inflated: DisplacementField | None
-    ct_from_deflated: DisplacementField
+    ct: Volume
+    from_ct: DisplacementField
+    to_ct: DisplacementField
 
 
-def fields_of(case: Case, found: Localization, spacing_mm: float) -> Fields:
-    """Inside the lung by the mesh, outside it by the spine, on voxels at most `spacing_mm` apart, if there are such.
+def carried(ct: Volume, lung_ct: Mask, scan_from_ct: MeshMap, grid: Grid, spacing_mm: float) -> Carried:
+    """The CT on a scan's grid, and both fields: inside the lung by the mesh, outside it by the spine, on voxels at most
+    `spacing_mm` apart, if there are such.
 
     What leads to the CT goes on beyond the lung for one voxel's diagonal, so that values between voxels inside are not
     blended with those outside.
     """
-    box = thinned(lung_box(found.prepared.lung_ct), spacing_mm)
-    inflated, deflated, scan = found.pose.inf_from_ct, found.def_from_ct, case.cbct_inflated
-    return Fields(
-        None if scan is None else sampled(inflated, box),
-        sampled(deflated, box),
-        None if scan is None else _back(inflated, scan.grid, spacing_mm),
-        _back(deflated, case.cbct_deflated.grid, spacing_mm),
-    )
+    box = thinned(lung_box(lung_ct), spacing_mm)
+    return Carried(warped_ct(ct, scan_from_ct, grid), sampled(scan_from_ct, box), _back(scan_from_ct, grid, spacing_mm))
 
 
 def _back(scan_from_ct: MeshMap, grid: Grid, spacing_mm: float) -> DisplacementField:
@@ -77,23 +70,21 @@ def lung_box(lung: Mask) -> Grid:
     return lung.grid.box(where.min(axis=0) - margin, where.max(axis=0) + 1 + margin)
 
 
-def fields_entry(fields: Fields, found: Localization) -> dict[str, Any]:
+def fields_entry(inflated: Carried | None, deflated: Carried, found: Localization) -> dict[str, Any]:
     """For run.json: how far apart each field's voxels lie, and how far off it is at the nodes of the lung's mesh, where
-    that is exact, mm.
+    that is exact, mm. inflated: None where that scan was not taken.
     """
-    ct, inflated, deflated = found.pose.mesh_ct.points, found.pose.points_inf, found.collapse.mesh_after.points
-    ends = {
-        "inflated_from_ct": (ct, inflated),
-        "deflated_from_ct": (ct, deflated),
-        "ct_from_inflated": (inflated, ct),
-        "ct_from_deflated": (deflated, ct),
-    }
-    told = {}
-    for name, (here, there) in ends.items():
-        field: DisplacementField | None = getattr(fields, name)
-        if field is not None:
-            told[name] = {"spacing_mm": field.grid.spacing, **_off(field, here, there)}
+    ct, told = found.pose.mesh_ct.points, {}
+    scans = {"inflated": (inflated, found.pose.points_inf), "deflated": (deflated, found.collapse.mesh_after.points)}
+    for name, (scan, points) in scans.items():
+        if scan is not None:
+            told[f"{name}_from_ct"] = _field_entry(scan.from_ct, ct, points)
+            told[f"ct_from_{name}"] = _field_entry(scan.to_ct, points, ct)
     return told
+
+
+def _field_entry(field: DisplacementField, here: Array, there: Array) -> dict[str, Any]:
+    return {"spacing_mm": field.grid.spacing, **_off(field, here, there)}
 
 
 def _off(field: DisplacementField, here: Array, there: Array) -> dict[str, float]:

@@ -8,6 +8,7 @@ follow far better than one, and the gas beside the collapsed lung, whose border 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -158,8 +159,11 @@ class _Scene:
         above = Sheet(self.hilum, np.asarray(shape)).distance(self.points) > 0
         if min(above.sum(), (~above).sum()) < LEAST_KEYPOINTS:
             return np.inf
-        terms = _terms(self.points - self.hilum)
-        return sum(_misfit(terms[side], self.motion[side]) for side in (above, ~above))
+        return sum(_misfit(self._terms[side], self.motion[side]) for side in (above, ~above))
+
+    @cached_property
+    def _terms(self) -> Array:
+        return _terms(self.points - self.hilum)
 
 
 def _terms(points: Array) -> Array:
@@ -188,8 +192,9 @@ def _fitted(terms: Array, motion: Array, rounds: int) -> tuple[Array, Array]:
     """Coefficients and misfits (n,) mm of a robust fit, products held back a little."""
     weight, ridge = np.ones(len(terms)), np.diag(_RIDGE[: terms.shape[1]])
     for _ in range(rounds):
-        weighted = (terms * weight[:, None]).T
+        weighted = terms.T * weight
         coefficients = np.linalg.solve(weighted @ terms + ridge, weighted @ motion)
-        left = np.linalg.norm(motion - terms @ coefficients, axis=1)
-        weight = 1 / (1 + (left / MOTION_MM) ** 2)
-    return coefficients, left
+        off = motion - terms @ coefficients
+        squared = np.einsum("nd,nd->n", off, off)
+        weight = 1 / (1 + squared / MOTION_MM**2)
+    return coefficients, np.sqrt(squared)

@@ -15,7 +15,7 @@ from importlib.resources import files
 from typing import Any, Literal
 
 import numpy as np
-from scipy import stats
+from scipy.special import fdtri
 
 from registration.volume import Array, Mask
 from vatsloc.formats.casefile import PleuralGas
@@ -78,7 +78,7 @@ def forecast(point: Array, middle: Array, side: Side, motions: Motions, gas: Ple
     spread = apart.T @ apart / freedom + motions.left.mean(axis=0)
     if kinds > 1:  # another kind of anatomy lies as far from these as they lie apart
         spread = spread + (kinds + 1) / kinds * np.cov(means.T)
-    reach = (n + 1) / n * 3 * freedom / (freedom - 2) * stats.f.ppf(0.95, 3, freedom - 2)
+    reach = (n + 1) / n * 3 * freedom / (freedom - 2) * fdtri(3, freedom - 2, 0.95)
     variance, directions = np.linalg.eigh(spread * np.outer(mirror, mirror) * reach)
     return Forecast(point + mean * mirror, np.sqrt(variance[::-1]), directions.T[::-1], n)
 

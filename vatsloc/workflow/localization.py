@@ -12,7 +12,7 @@ from registration.volume import Array
 from vatsloc.case import Case
 from vatsloc.errors import NotConverged
 from vatsloc.maps import MeshMap
-from vatsloc.workflow.check import VOXEL_MM, Checks, check_gates, compare
+from vatsloc.workflow.check import CHECK, VOXEL_MM, Checks, check_gates, compare
 from vatsloc.workflow.gates import Gate
 from vatsloc.workflow.pneumothorax import Collapse
 from vatsloc.workflow.pose import ChangeOfPose
@@ -85,16 +85,12 @@ def checked(
     case: Case, found: Localization, settings: Settings, stages: Stages, phase1: LeftOver | None = None
 ) -> Localization:
     """The result with the gates of its check by independent keypoints, and with a wider ellipsoid where these show an
-    error that it does not hold. phase1: what is left over of the change of pose, where that is known.
+    error that it does not hold. phase1: what is left over of the change of pose, None without an inflated scan.
     """
-    with stages.stage("check"):
+    with stages.stage(CHECK):
         ct, prepared, pose, collapse = coarsen(case.ct, VOXEL_MM), found.prepared, found.pose, found.collapse
-        if phase1 is None and case.cbct_inflated is not None:
-            phase1 = compare(ct, prepared.inflated, pose.lung_inf, pose.inf_from_ct)
-        checks = Checks(
-            phase1,
-            compare(ct, prepared.deflated, collapse.observed.found.lung, found.def_from_ct),
-        )
+        chain = compare(ct, prepared.deflated, collapse.observed.found.lung, found.def_from_ct)
+        checks = Checks(phase1, chain)
         here = found.nodule_inf[None], found.nodule_def[None]
         (lengths,), (axes,) = ellipsoid95(covariance(pose, collapse, *here, checks.chain))
         gates = {

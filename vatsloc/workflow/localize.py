@@ -11,9 +11,11 @@ scans by keypoints that nothing before it has used.
 
 from __future__ import annotations
 
+from functools import partial
+
 from vatsloc.case import Case
 from vatsloc.workflow.localization import Localization, checked, locate_nodule
-from vatsloc.workflow.observe import spine_from_ct
+from vatsloc.workflow.observe import HILUM, lung_of_model, spine_from_ct
 from vatsloc.workflow.parted import in_pieces
 from vatsloc.workflow.piece_contact import held_apart
 from vatsloc.workflow.pneumothorax import pneumothorax, refined
@@ -21,7 +23,7 @@ from vatsloc.workflow.prepare import begin_scans, prepare
 from vatsloc.workflow.settings import Settings
 from vatsloc.workflow.stages import Stages
 from vatsloc.workflow.stand_in import stand_in
-from vatsloc.workflow.state import State, before_collapse
+from vatsloc.workflow.state import State, before_collapse, begin_check, with_check
 
 
 def localize(case: Case, settings: Settings, stages: Stages, state: State | None = None) -> Localization:
@@ -29,16 +31,16 @@ def localize(case: Case, settings: Settings, stages: Stages, state: State | None
 
     Raises InputRefused for images that do not show what they should, NotConverged when a solver has no answer.
     """
-    if state is None and case.cbct_inflated is not None:
-        begin_scans(case, case.cbct_inflated, stages)
-    try:
+    with stages.beside():
+        if state is None and case.cbct_inflated is not None:
+            begin_scans(case, case.cbct_inflated, stages)
         return _localized(case, settings, stages, state)
-    finally:
-        stages.forget()
 
 
 def _localized(case: Case, settings: Settings, stages: Stages, state: State | None) -> Localization:
     known = before_collapse(case, settings, stages, state)
+    stages.begin(HILUM, "", partial(lung_of_model, known.prepared, case.side, settings))
+    begin_check(case, known, stages)
     before, pose = known.complete or stand_in(case, known.prepared, settings, stages)
     prepared = prepare(case, stages, before)
     spine = None if known.complete else spine_from_ct(case, prepared, stages)
@@ -47,4 +49,4 @@ def _localized(case: Case, settings: Settings, stages: Stages, state: State | No
     collapse = refined(case, prepared, pose, collapse, settings, stages)
     collapse = held_apart(collapse, settings, stages)
     found = locate_nodule(case, prepared, pose, collapse, settings, stages)
-    return checked(case, found, settings, stages, known.left_over)
+    return checked(case, found, settings, stages, with_check(case, known, stages).left_over)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -22,9 +23,11 @@ from vatsloc.imaging.thorax import SPACING_MM, ThoraxPrior
 from vatsloc.maps import MeshMap, covered, sampled
 from vatsloc.workflow.hilum import HilumMotion, HilumSource, hilum_motion
 from vatsloc.workflow.pose import ChangeOfPose, as_side
-from vatsloc.workflow.prepare import SPINE_INFLATED_TO_DEFLATED, Prepared, pose_between
+from vatsloc.workflow.prepare import SPINE_INFLATED_TO_DEFLATED, Prepared, PreparedCt, pose_between
 from vatsloc.workflow.settings import Settings
 from vatsloc.workflow.stages import DEFLATED, Stages
+
+HILUM = "hilum"
 
 
 @dataclass(frozen=True)
@@ -66,8 +69,16 @@ def observe(
             rigid = stages.done(lambda: pose_between(inflated, deflated))
     def_from_inf = rigid.moving_from_fixed.inverse()
     before = TetMesh(def_from_inf(pose.points_inf), pose.mesh_ct.tets)
+    with stages.stage(HILUM):
+        hilum_ct, coarse = stages.done(partial(lung_of_model, prepared, case.side, settings))
+        to_def = MeshMap(pose.mesh_ct, before.points, def_from_inf @ pose.inf_from_ct_rigid)
+        hilum = Hilum(to_def(hilum_ct.point_ras[None])[0], hilum_ct.radius_mm, hilum_ct.on_airways)
+        model_mesh = TetMesh(to_def(coarse.points), coarse.tets)
+        nodes = held_nodes(model_mesh, hilum.point_ras, settings.model.hilum_radius_mm)
     with stages.stage("deflated surface", DEFLATED):
         prior = _prior(prepared, pose, def_from_inf, case.side)
+        moved = partial(_motion, prepared, prior, hilum, def_from_inf, model_mesh.points[nodes], settings)
+        stages.begin(HILUM, "", moved)
         found = find_pneumothorax(prepared.deflated, prior)
         surface = _hinted_surface(case) or deflated_surface(found, prepared.deflated.field)
         if not surface.confidence.any():
@@ -75,15 +86,16 @@ def observe(
                 f"The {DEFLATED} shows nothing of the collapsed lung's surface; take a scan of the operated side after "
                 "the lung was let down, or give points of its surface in case.toml, [hints] deflated_surface."
             )
-    with stages.stage("hilum"):
-        hilum_ct = find_hilum(prepared.lung_ct, prepared.lungs.airways, as_side(case.side))
-        to_def = MeshMap(pose.mesh_ct, before.points, def_from_inf @ pose.inf_from_ct_rigid)
-        hilum = Hilum(to_def(hilum_ct.point_ras[None])[0], hilum_ct.radius_mm, hilum_ct.on_airways)
-        coarse = stuff(prepared.lung_ct.inside, prepared.lung_ct.ras_from_ijk, settings.mesh.model_edge_mm)
-        model_mesh = TetMesh(to_def(coarse.points), coarse.tets)
-        nodes = held_nodes(model_mesh, hilum.point_ras, settings.model.hilum_radius_mm)
-        motion = _motion(prepared, prior, hilum, def_from_inf, model_mesh.points[nodes], settings)
+    with stages.stage(HILUM):
+        motion = stages.done(moved)
     return Observed(rigid, found, surface, before, model_mesh, hilum, nodes, motion)
+
+
+def lung_of_model(prepared: PreparedCt, side: str, settings: Settings) -> tuple[Hilum, TetMesh]:
+    """The lung's hilum in the CT, and the model's mesh there."""
+    lung = prepared.lung_ct
+    hilum = find_hilum(lung, prepared.lungs.airways, as_side(side))
+    return hilum, stuff(lung.inside, lung.ras_from_ijk, settings.mesh.model_edge_mm)
 
 
 def spine_from_ct(case: Case, prepared: Prepared, stages: Stages) -> RigidFit:

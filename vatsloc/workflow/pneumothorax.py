@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from poro.collapse import PoroSystem
+from poro.fem import Tissue, prepare_solid
 from poro.fit import Fit, Identifiability, identifiability
 from poro.mesh import TetMesh, TriSurface, interpolate, locate
 from registration.maps.rigid import RigidTransform
@@ -20,7 +22,7 @@ from vatsloc.workflow.model_selection import CollapseModel, select_model
 from vatsloc.workflow.observe import Observed, observe
 from vatsloc.workflow.pose import ChangeOfPose
 from vatsloc.workflow.prepare import Prepared
-from vatsloc.workflow.refinement import BlockRefinement, Compared, Shape, refine_by_blocks
+from vatsloc.workflow.refinement import BlockRefinement, Compared, Prospect, Shape, prospect, refine_by_blocks
 from vatsloc.workflow.residual import Residual, residual_registration
 from vatsloc.workflow.settings import Settings
 from vatsloc.workflow.stages import Stages
@@ -95,6 +97,8 @@ def pneumothorax(
     spine: its pose, where it is known.
     """
     observed = observe(case, prepared, pose, settings, stages, spine)
+    if settings.refinement.on:
+        stages.begin(REFINEMENT, "", partial(_prospect, case, prepared, observed, settings))
     return collapse(case, prepared, pose, observed, settings, stages)
 
 
@@ -131,9 +135,15 @@ def refined(
             np.zeros(0, dtype=int),
             cut=None if collapse.parted is None else collapse.parted.fissure.sheet.distance,
         )
-        compared = Compared(case.ct, prepared.lung_ct, prepared.deflated, collapse.observed.found.lung)
-        refinement = refine_by_blocks(compared, shape, settings.refinement)
+        known = stages.done(partial(_prospect, case, prepared, collapse.observed, settings))
+        refinement = refine_by_blocks(known, shape)
     return replace(collapse, points_after=refinement.points, refinement=refinement)
+
+
+def _prospect(case: Case, prepared: Prepared, observed: Observed, settings: Settings) -> Prospect:
+    """What is ready for the refinement by blocks as soon as the collapsed lung is found."""
+    prepare_solid(observed.mesh_before, Tissue())
+    return prospect(Compared(case.ct, prepared.lung_ct, prepared.deflated, observed.found.lung), settings.refinement)
 
 
 def _residual(

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from scipy import ndimage
 
-from poro.fem import Extrapolation, Tissue, extrapolate
+from poro.fem import Extrapolation, Tissue, extrapolate, prepare_solid
 from poro.mesh import TetMesh, closest_points, stuff
 from poro.mesh.tetmesh import signed_volumes
 from registration.ffd import FfdFit, FfdSettings, Weights
@@ -25,7 +26,7 @@ from vatsloc.imaging.thorax import carry_prior, inflated_lung, require_share, vi
 from vatsloc.maps import MeshMap
 from vatsloc.workflow.choices import Choice, weigh
 from vatsloc.workflow.prepare import PreparedBefore
-from vatsloc.workflow.refinement import BlockRefinement, Compared, Shape, refine_by_blocks
+from vatsloc.workflow.refinement import BlockRefinement, Compared, Prospect, Shape, prospect, refine_by_blocks
 from vatsloc.workflow.settings import RegistrationSettings, Settings
 from vatsloc.workflow.stages import CT, INFLATED, Stages
 
@@ -40,6 +41,7 @@ Near the wall no texture told it anything, and a spline runs on straight while t
 POLYNOMIAL_MM = 50.0
 LEAST_STRETCH = 0.3
 """Smallest det of the gradient of a polynomial map that the lung may be laid out by."""
+REFINEMENT = "block refinement, inflated"
 HINT_REACH_MM = 10.0
 """How far a marked vertebra may be off: less than half the distance to the next one."""
 FIRST = "first registration"
@@ -113,6 +115,8 @@ def change_of_pose(
     with stages.stage("mesh", CT):
         mesh = stuff(prepared.lung_ct.inside, prepared.lung_ct.ras_from_ijk, settings.mesh.edge_mm)
     placed = TetMesh(inf_from_ct_rigid(mesh.points), mesh.tets)
+    if settings.registration.on and settings.refinement.on:
+        stages.begin(REFINEMENT, "", partial(_prospect, case, prepared, lung_inf, placed, settings))
     stages.fail_early()  # before what takes long
     if not settings.registration.on:
         stages.skip("free-form deformation", "switched off in the settings")
@@ -136,10 +140,10 @@ def change_of_pose(
         extension = continued(mesh, placed, inversion.points_fixed, seen, settled)
     points, refinement = placed.points + extension.u, None
     if settings.refinement.on:
-        with stages.stage("block refinement, inflated"):
+        with stages.stage(REFINEMENT):
             to_inflated = MeshMap(mesh, points, inf_from_ct_rigid)
             refinement = refine_by_blocks(
-                Compared(case.ct, prepared.lung_ct, prepared.inflated, lung_inf),
+                stages.done(partial(_prospect, case, prepared, lung_inf, placed, settings)),
                 Shape(
                     placed,
                     to_inflated,
@@ -147,11 +151,10 @@ def change_of_pose(
                     DEEP_MM,
                     inflated_surface(lung_inf, prepared.inflated.volume, prepared.inflated.field),
                 ),
-                settings.refinement,
             )
         points = refinement.points
     else:
-        stages.skip("block refinement, inflated", "switched off in the settings")
+        stages.skip(REFINEMENT, "switched off in the settings")
     return ChangeOfPose(
         rigid=rigid,
         ffd=ffd,
@@ -164,6 +167,14 @@ def change_of_pose(
         overlap=overlap,
         refinement=refinement,
     )
+
+
+def _prospect(
+    case: CaseBefore, prepared: PreparedBefore, lung_inf: Mask, placed: TetMesh, settings: Settings
+) -> Prospect:
+    """What is ready for the refinement by blocks as soon as the inflated lung is found."""
+    prepare_solid(placed, Tissue())
+    return prospect(Compared(case.ct, prepared.lung_ct, prepared.inflated, lung_inf), settings.refinement)
 
 
 def moved_far(fit: SlidingFit, limit_mm: float) -> Choice:

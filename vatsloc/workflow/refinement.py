@@ -20,7 +20,7 @@ from poro.mesh.tetmesh import signed_volumes
 from registration.correspondences import Correspondences
 from registration.images.morphology import bounding_box, erode
 from registration.images.resample import coarsen, resample_mask
-from registration.keypoints.aligned_matching import AlignedSettings, Regions, match_aligned
+from registration.keypoints.aligned_matching import AlignedSettings, Organ, match_aligned, organ_of
 from registration.keypoints.matching import MatchSettings, detect_inside
 from registration.volume import Array, Mask, Volume
 from vatsloc.imaging.cbct import PreparedCbct
@@ -61,6 +61,16 @@ class Compared:
     lung_ct: Mask
     scan: PreparedCbct
     lung: Mask
+
+
+@dataclass(frozen=True)
+class Prospect:
+    """What both images tell before a map between them is known. points: (n, 3) distinctive ones of the scan's lung,
+    where blocks can be followed; lungs: of each pass, the scan's and the CT's, ready for matching.
+    """
+
+    points: Array
+    lungs: tuple[tuple[Organ, Organ], ...]
 
 
 @dataclass(frozen=True)
@@ -107,17 +117,17 @@ class BlockRefinement:
     followed: Correspondences | None = None
 
 
-def refine_by_blocks(compared: Compared, shape: Shape, settings: RefinementSettings) -> BlockRefinement:
+def refine_by_blocks(prospect: Prospect, shape: Shape) -> BlockRefinement:
     """Nodes of a lung moved to where small blocks of the CT are found in a scan; as they were where none judge well.
 
     Until the last pass held-out blocks are not followed, then all are, from what the passes before left.
     """
-    around = _around(compared)
-    starts = _starts(around, shape, settings.cell_mm)
+    starts = _within_reach(prospect.points, shape)
     passes: list[Pass] = []
     trial, answer = shape, None
-    for voxel_mm, reach_mm in PASSES:
-        matches = _blocks(around, starts, trial.map, voxel_mm, reach_mm)
+    for lungs, (voxel_mm, reach_mm) in zip(prospect.lungs, PASSES, strict=True):
+        back = trial.map.inverse().linearized
+        matches = match_aligned(*lungs, starts, back, AlignedSettings(reach_mm))
         if np.isfinite(shape.within_mm):
             matches = matches.only(_depth(shape.map.mesh, matches.moving) <= shape.within_mm)
         if shape.cut is not None:
@@ -153,28 +163,27 @@ def _around(compared: Compared) -> Compared:
     return Compared(ct.part(cut_ct), inner_ct, replace(scan, volume=scan.volume.part(cut)), inner)
 
 
-def _starts(compared: Compared, shape: Shape, cell_mm: float) -> Array:
-    """Distinctive points (n, 3) RAS mm of the scan's lung where blocks are followed, at most one a cell."""
-    image = coarsen(compared.scan.volume, PASSES[0][0])
-    inside = resample_mask(compared.lung, image.grid).inside
+def prospect(compared: Compared, settings: RefinementSettings) -> Prospect:
+    """What can be made ready before a map from the CT to the scan is known; at most one point a cell."""
+    around = _around(compared)
+    lungs = [(coarsen(around.scan.volume, voxel_mm), coarsen(around.ct, voxel_mm)) for voxel_mm, _ in PASSES]
+    organs = tuple(
+        (organ_of(scan, resample_mask(around.lung, scan.grid)), organ_of(ct, resample_mask(around.lung_ct, ct.grid)))
+        for scan, ct in lungs
+    )
+    image, inside = lungs[0][0], organs[0][0].image.inside
     if not inside.any():
-        return np.zeros((0, 3))
-    settings = MatchSettings(voxel_mm=PASSES[0][0], cell_mm=cell_mm)
-    points = image.grid.to_ras(detect_inside(image, inside, settings).astype(float))
+        return Prospect(np.zeros((0, 3)), organs)
+    match = MatchSettings(voxel_mm=PASSES[0][0], cell_mm=settings.cell_mm)
+    return Prospect(image.grid.to_ras(detect_inside(image, inside, match).astype(float)), organs)
+
+
+def _within_reach(points: Array, shape: Shape) -> Array:
+    """Those of points (n, 3) of the scan whose blocks may lie no deeper than a lung is to follow them."""
     if np.isinf(shape.within_mm):
         return points
     at = shape.map.inverse()(points)
     return np.asarray(points[_depth(shape.map.mesh, at) <= shape.within_mm + PASSES[0][1]])
-
-
-def _blocks(
-    compared: Compared, starts: Array, scan_from_ct: MeshMap, voxel_mm: float, reach_mm: float
-) -> Correspondences:
-    """Blocks of the scan about points (n, 3), `fixed`, found in the CT, `moving`."""
-    scan, ct = coarsen(compared.scan.volume, voxel_mm), coarsen(compared.ct, voxel_mm)
-    regions = Regions(resample_mask(compared.lung, scan.grid), resample_mask(compared.lung_ct, ct.grid))
-    back = scan_from_ct.inverse().linearized
-    return match_aligned(scan, ct, regions, starts, back, AlignedSettings(reach_mm))
 
 
 def _depth(mesh: TetMesh, points: Array) -> Array:

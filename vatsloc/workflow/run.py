@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ from vatsloc.frames import flip_points
 from vatsloc.maps import covered, sampled
 from vatsloc.report.collect import report_data
 from vatsloc.report.data import LUNG, SURFACE, Outline, Picture
-from vatsloc.report.render import write_report
+from vatsloc.report.render import render
 from vatsloc.report.words import WORDS
 from vatsloc.results import (
     RADIUS95,
@@ -36,7 +37,7 @@ from vatsloc.results import (
     write_results,
 )
 from vatsloc.slicer_scene import write_result_scenes
-from vatsloc.workflow.fields import Fields, fields_entry, fields_of, warped_ct
+from vatsloc.workflow.fields import Carried, carried, fields_entry
 from vatsloc.workflow.localization import Localization
 from vatsloc.workflow.localize import localize
 from vatsloc.workflow.pneumothorax import contact_surface
@@ -45,10 +46,11 @@ from vatsloc.workflow.quality import surface_percentiles
 from vatsloc.workflow.refinement import BlockRefinement
 from vatsloc.workflow.residual import Residual
 from vatsloc.workflow.settings import Settings
-from vatsloc.workflow.stages import Say, Stages, quiet
+from vatsloc.workflow.stages import DEFLATED, INFLATED, Say, Stages, quiet
 from vatsloc.workflow.state import State, read_state
 from vatsloc.workflow.uncertainty import radius95, scatter
 
+WARP, PAGE = "warp", "report"
 FIELD_MARGIN_MM = 10.0
 BALL_MM = 5.0
 GAS_HU = -1000.0
@@ -72,32 +74,40 @@ def run_case(
     """
     stages = Stages(say)
     expected = output_files(read_case_file(folder).images.cbct_inflated is not None)
-    with whole_folder(out, expected) as partial, stages.named():
+    with whole_folder(out, expected) as unfinished, stages.named(), stages.beside():
         with stages.stage("read"):
             case = read_case(folder)
         for sentence in case.warnings:
             stages.warn(sentence)
         known = None if state is None else _taken_up(state, case, settings, stages)
         found = localize(case, settings, stages, known)
+        if case.cbct_inflated is not None:
+            stages.begin(WARP, INFLATED, partial(_in_inflated, case, case.cbct_inflated, found, settings))
         record = _record(case, found, settings, stages)
-        answer = write_answer(partial, record, found.nodule_def)
+        answer = write_answer(unfinished, record, found.nodule_def)
         if answered is not None:
             answered(answer)
-        with stages.stage("warp"):
-            fields = fields_of(case, found, settings.output.field_mm)
-            result = _result(case, found, fields, record)
+        with stages.stage(WARP, DEFLATED):
+            deflated = _in_deflated(case, found, settings)
+        with stages.stage(WARP, INFLATED):
+            inflated = None
+            if case.cbct_inflated is not None:
+                inflated = stages.done(partial(_in_inflated, case, case.cbct_inflated, found, settings))
         with stages.stage("write"):
+            result = _result(case, found, inflated, deflated, record)
             objects, why = dicom_of_run(folder, result)
             if why:
                 stages.warn(f"No DICOM objects were written: {why}")
             record = replace(record, warnings=tuple(stages.warnings))
-            result = replace(result, run=_with_fields(record, fields, found, stages))
-            write_results(partial, result)
-            write_objects(partial, objects)
-            write_inputs(partial, folder, out)
-            write_result_scenes(partial, folder, out, result)
-        with stages.stage("report"):
-            write_report(partial / REPORT, report_data(case, result, _pictures(case, found)))
+            result = replace(result, run=_with_fields(record, inflated, deflated, found, stages))
+            report = partial(_report, case, found, result)
+            stages.begin(PAGE, "", report)
+            write_results(unfinished, result)
+            write_objects(unfinished, objects)
+            write_inputs(unfinished, folder, out)
+            write_result_scenes(unfinished, folder, out, result)
+        with stages.stage(PAGE):
+            (unfinished / REPORT).write_text(stages.done(report), encoding="utf-8")
     return result.run.as_json()
 
 
@@ -109,7 +119,23 @@ def _taken_up(folder: Path, case: Case, settings: Settings, stages: Stages) -> S
     return known
 
 
-def _result(case: Case, found: Localization, fields: Fields, run: RunRecord) -> ResultData:
+def _in_inflated(case: Case, scan: Volume, found: Localization, settings: Settings) -> Carried:
+    return carried(case.ct, found.prepared.lung_ct, found.pose.inf_from_ct, scan.grid, settings.output.field_mm)
+
+
+def _in_deflated(case: Case, found: Localization, settings: Settings) -> Carried:
+    """With the CT as the collapsed lung shows it: what was lung and is not any more has become pleural gas."""
+    grid = case.cbct_deflated.grid
+    there = carried(case.ct, found.prepared.lung_ct, found.def_from_ct, grid, settings.output.field_mm)
+    before, after = (covered(mesh, grid).inside for mesh in (found.collapse.mesh_before, found.collapse.mesh_after))
+    return replace(there, ct=Volume(np.where(before & ~after, np.float32(GAS_HU), there.ct.hu), grid.ras_from_ijk))
+
+
+def _report(case: Case, found: Localization, result: ResultData) -> str:
+    return render(report_data(case, result, _pictures(case, found)))
+
+
+def _result(case: Case, found: Localization, inflated: Carried | None, deflated: Carried, run: RunRecord) -> ResultData:
     pose, collapse = found.pose, found.collapse
     state, after = collapse.fit.state, collapse.mesh_after
     before = collapse.mesh_before
@@ -122,19 +148,17 @@ def _result(case: Case, found: Localization, fields: Fields, run: RunRecord) -> 
         nodule_inflated_ras=found.nodule_inf,
         nodule_deflated_ras=found.nodule_def,
         nodule_mask_deflated=_nodule_mask(case, found),
-        ct_in_inflated=None
-        if case.cbct_inflated is None
-        else warped_ct(case.ct, pose.inf_from_ct, case.cbct_inflated.grid),
-        ct_in_deflated=_ct_in_deflated(case, found),
+        ct_in_inflated=None if inflated is None else inflated.ct,
+        ct_in_deflated=deflated.ct,
         lung_ct=_tetra(pose.mesh_ct, np.zeros_like(pose.points_inf), none, np.ones(len(pose_det)), none),
         lung_inflated=_tetra(pose.mesh_inf, pose.points_inf - pose.mesh_ct.points, none, pose_det, none),
         lung_deflated=_with_radius95(found, _tetra(after, after.points - pose.points_inf, pressure, det_f, contact)),
         deflated_surface=Surface(outer.points, outer.triangles),
         contact_surface=Surface(wall.points, wall.triangles),
-        inflated_from_ct=fields.inflated_from_ct,
-        deflated_from_ct=fields.deflated_from_ct,
-        ct_from_inflated=fields.ct_from_inflated,
-        ct_from_deflated=fields.ct_from_deflated,
+        inflated_from_ct=None if inflated is None else inflated.from_ct,
+        deflated_from_ct=deflated.from_ct,
+        ct_from_inflated=None if inflated is None else inflated.to_ct,
+        ct_from_deflated=deflated.to_ct,
         rigid_inflated_from_ct=pose.inf_from_ct_rigid.matrix,
         rigid_deflated_from_inflated=collapse.def_from_inf_rigid.matrix,
         run=run,
@@ -174,16 +198,6 @@ def _nodule_mask(case: Case, found: Localization) -> Mask:
     return Mask(inside, grid.ras_from_ijk)
 
 
-def _ct_in_deflated(case: Case, found: Localization) -> Volume:
-    """The CT as the collapsed lung shows it: what was lung and is not any more has become pleural gas."""
-    warped = warped_ct(case.ct, found.def_from_ct, case.cbct_deflated.grid)
-    left = (
-        covered(found.collapse.mesh_before, warped.grid).inside
-        & ~covered(found.collapse.mesh_after, warped.grid).inside
-    )
-    return Volume(np.where(left, np.float32(GAS_HU), warped.hu), warped.ras_from_ijk)
-
-
 def _record(case: Case, found: Localization, settings: Settings, stages: Stages) -> RunRecord:
     theta = found.collapse.fit.theta
     return RunRecord(
@@ -220,9 +234,11 @@ def _record(case: Case, found: Localization, settings: Settings, stages: Stages)
     )
 
 
-def _with_fields(record: RunRecord, fields: Fields, found: Localization, stages: Stages) -> RunRecord:
+def _with_fields(
+    record: RunRecord, inflated: Carried | None, deflated: Carried, found: Localization, stages: Stages
+) -> RunRecord:
     """The record with what the fields leave out, and the seconds and memory of what followed the answer."""
-    details = {"peak_mb_by_stage": dict(stages.peak_mb), "fields": fields_entry(fields, found)}
+    details = {"peak_mb_by_stage": dict(stages.peak_mb), "fields": fields_entry(inflated, deflated, found)}
     return replace(
         record,
         seconds={**stages.seconds, "answer": record.seconds["total"], "total": stages.total_seconds},

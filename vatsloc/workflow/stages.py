@@ -100,6 +100,14 @@ class Stages:
                 with self.stage(name, image):
                     future.result()
 
+    @contextmanager
+    def beside(self) -> Iterator[None]:
+        """Inside, work may be begun; what was not asked for by the end is dropped."""
+        try:
+            yield
+        finally:
+            self.forget()
+
     def forget(self) -> None:
         """Drop what was begun and not asked for; what is at work ends by itself."""
         if self._beside is not None:

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import json
 import zipfile
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,10 +22,11 @@ from vatsloc.errors import CaseError
 from vatsloc.formats.folder import PROGRAM, whole_folder
 from vatsloc.formats.trees import digest, flattened, restored
 from vatsloc.results import source_digest, versions
-from vatsloc.workflow.check import VOXEL_MM, compare
+from vatsloc.workflow.check import CHECK, VOXEL_MM, compare
 from vatsloc.workflow.pose import ChangeOfPose, change_of_pose
 from vatsloc.workflow.prepare import PreparedBefore, PreparedCt, prepare_before, prepare_ct
 from vatsloc.workflow.settings import Settings
+from vatsloc.workflow.stages import INFLATED as INFLATED_CBCT
 from vatsloc.workflow.stages import Log, Say, Stages, quiet
 
 STATE_FILE, ARRAYS_FILE = "state.json", "arrays.npz"
@@ -42,8 +44,8 @@ CALLED = {
 
 @dataclass(frozen=True)
 class State:
-    """prepared: the CT, and the inflated scan where it was there, which then has its change of pose, and what this
-    leaves over by the run's check; log: what the stages said.
+    """prepared: the CT, and the inflated scan where it was there, which then has its change of pose; left_over: what
+    this leaves over by the run's check, None before that; log: what the stages said.
     """
 
     prepared: PreparedCt
@@ -72,10 +74,25 @@ def before_collapse(case: CaseBefore, settings: Settings, stages: Stages, known:
     if case.cbct_inflated is None:
         return State(ct, None, None, stages.log())
     prepared = prepare_before(case, case.cbct_inflated, stages, ct)
-    pose = change_of_pose(case, prepared, settings, stages)
-    with stages.stage("check"):
-        left = compare(coarsen(case.ct, VOXEL_MM), prepared.inflated, pose.lung_inf, pose.inf_from_ct)
-    return State(prepared, pose, left, stages.log())
+    return State(prepared, change_of_pose(case, prepared, settings, stages), None, stages.log())
+
+
+def begin_check(case: CaseBefore, known: State, stages: Stages) -> None:
+    """Begin the comparison of the CT with the inflated scan, beside what follows."""
+    if known.complete is not None and known.left_over is None:
+        stages.begin(CHECK, INFLATED_CBCT, partial(_left_over, case, *known.complete))
+
+
+def with_check(case: CaseBefore, known: State, stages: Stages) -> State:
+    """With what is left over of the change of pose, where there was one."""
+    if known.complete is None or known.left_over is not None:
+        return known
+    with stages.stage(CHECK, INFLATED_CBCT):
+        return replace(known, left_over=stages.done(partial(_left_over, case, *known.complete)), log=stages.log())
+
+
+def _left_over(case: CaseBefore, prepared: PreparedBefore, pose: ChangeOfPose) -> LeftOver:
+    return compare(coarsen(case.ct, VOXEL_MM), prepared.inflated, pose.lung_inf, pose.inf_from_ct)
 
 
 def prepare_case(folder: Path, out: Path, settings: Settings, say: Say = quiet) -> dict[str, Any]:
@@ -92,7 +109,8 @@ def prepare_case(folder: Path, out: Path, settings: Settings, say: Say = quiet) 
         known = _earlier(out, case, settings, say)
         if known is not None:
             stages.resume(known.log)
-        known = before_collapse(case, settings, stages, known)
+        with stages.beside():
+            known = with_check(case, before_collapse(case, settings, stages, known), stages)
         with stages.stage("write"):
             write_state(partial, known, key_of(case, settings, known.scans))
     return {"state": str(out), "scans": list(known.scans), "seconds": stages.total_seconds}
