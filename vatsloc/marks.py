@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from scipy import ndimage
 
+from registration.images.morphology import bounding_box
 from registration.images.resample import resample_mask
 from registration.volume import Array, Grid, Mask
 from vatsloc.errors import InputRefused
@@ -155,7 +156,8 @@ def _nodule_point(source: NoduleSource, path: Path, ct: Grid, mask: Mask | None,
 
 def _largest_part(mask: Mask, path: Path, warnings: list[str]) -> Mask:
     """The connected part that is the nodule; specks are dropped with a warning, a second nodule is refused."""
-    labels, n = ndimage.label(mask.inside, structure=np.ones((3, 3, 3)))
+    about = bounding_box(mask.inside, np.zeros(3))
+    labels, n = ndimage.label(mask.inside[about], structure=np.ones((3, 3, 3)))
     if n == 1:
         return mask
     sizes = np.bincount(labels.ravel())[1:]
@@ -167,7 +169,9 @@ def _largest_part(mask: Mask, path: Path, warnings: list[str]) -> Mask:
             "keep one nodule per case."
         )
     warnings.append(f"{path.name}: {others} voxels apart from the nodule were left out.")
-    return Mask(labels == largest + 1, mask.ras_from_ijk)
+    inside = np.zeros_like(mask.inside)
+    inside[about] = labels == largest + 1
+    return Mask(inside, mask.ras_from_ijk)
 
 
 def _check_nodule_size(mask: Mask, path: Path) -> None:
