@@ -44,6 +44,7 @@ class Scene:
     ensemble: Any = field(default_factory=lambda: np.zeros((0, 0, 3)))
     blocks: Any = None
     parted: Any = None
+    fissure: Any = None
     moved: Any = 0.0
 
     @property
@@ -79,6 +80,7 @@ class Scene:
             points_after=self.mesh.points + self.moved,
             refinement=None if self.blocks is None else SimpleNamespace(followed=self.blocks),
             parted=self.parted,
+            fissure=self.fissure,
         )
 
     def covariance(self, *points: list[float]) -> Any:
@@ -132,15 +134,39 @@ def test_tissue_is_no_surer_than_the_registration_that_matched_the_keypoints_abo
     assert_allclose(correspondence_sigma_mm(np.zeros(3), np.array([0.0, 0.3, 0.4])), [0.5, 0.5, 0.6])
 
 
-def test_where_small_blocks_were_followed_their_distance_and_misfit_alone_tell(ball: TetMesh) -> None:
+def test_where_small_blocks_were_followed_their_distance_and_misfit_tell(ball: TetMesh) -> None:
     n = len(ball.points)
     at = np.array([[-20.0, -4, 0], [-20.0, 4, 0]])
     blocks = Correspondences.of(at + np.array([[0, 0, 1.0], [0, 0, 2.0]]), at)
-    scene = Scene(ball, np.ones(n, bool), np.full(n, 9.0), keypoints=at, missed=5.0, blocks=blocks)
+    scene = Scene(ball, np.ones(n, bool), np.full(n, 9.0), keypoints=at, missed=0.5, blocks=blocks)
     near, far = scene.covariance([-20, 2, 1.5], [20, 0, 1.5])
     assert_allclose(near, (PER_BLOCK_MISFIT * 1.5) ** 2 * np.eye(3), rtol=1e-9)
     away = PER_BLOCK_MM * (40 - BLOCK_REACH_MM)
     assert_allclose(far, (PER_BLOCK_MISFIT * 1.5 + away) ** 2 * np.eye(3), rtol=1e-9)
+
+
+def test_keypoints_that_a_lung_misses_although_it_followed_blocks_make_it_less_sure(ball: TetMesh) -> None:
+    at = np.array([[-20.0, -4, 0], [-20.0, 4, 0]])
+    blocks = Correspondences.of(at + np.array([0, 0, 0.5]), at)
+    missed = np.array([[0.0, 6.0, 0.0], [2.0, 0.0, 0.0]])
+    (found,) = Scene(ball, keypoints=at, missed=missed, blocks=blocks).covariance([-20, 0, 0.5])
+    assert_allclose(found, (1.5 * (4.0 - 1.0)) ** 2 * np.eye(3), rtol=1e-9)
+
+
+def test_blocks_of_the_other_side_of_a_sheet_tell_nothing_where_a_lung_came_apart_and_is_not_cut(ball: TetMesh) -> None:
+    at = np.array([[0.0, 0, 6.0], [0.0, 0, -30.0]])
+    blocks = Correspondences.of(at, at)
+    sheet = SimpleNamespace(distance=lambda x: x[:, 2])
+    bare, covered = (SimpleNamespace(sheet=sheet, is_bare=is_bare) for is_bare in (True, False))
+    sigma = PER_BLOCK_MM * (28.0 - BLOCK_REACH_MM)
+    (found,) = Scene(ball, blocks=blocks, fissure=bare).covariance([0, 0, -2])
+    assert_allclose(found, sigma**2 * np.eye(3), rtol=1e-9)
+    (found,) = Scene(ball, blocks=blocks, fissure=bare).covariance([0, 0, 6])
+    assert_allclose(found, LEAST_MM**2 * np.eye(3), rtol=1e-9)
+    middle = np.linalg.norm(at.mean(axis=0) - [0, 0, -2])
+    whole = PER_BLOCK_MM * (middle - BLOCK_REACH_MM)
+    for other in (Scene(ball, blocks=blocks), Scene(ball, blocks=blocks, fissure=covered)):
+        assert_allclose(other.covariance([0, 0, -2])[0], whole**2 * np.eye(3), rtol=1e-9)
 
 
 def test_the_nearest_blocks_alone_tell(ball: TetMesh) -> None:

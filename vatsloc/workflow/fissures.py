@@ -71,6 +71,11 @@ class Sheet:
         return np.asarray((z + slope * y + tilt * x + offset + bulge) / np.sqrt(1 + slope**2 + tilt**2))
 
 
+COVERED_MM = 30.0
+"""How far half of a piece may lie from its own keypoints: farther off nothing tells where it went, and held-out
+keypoints, which lie near others, do not notice."""
+
+
 @dataclass(frozen=True)
 class Fissure:
     """A sheet along which the lung may have parted. cost_share: cost of two smooth maps of the keypoints' motion over
@@ -89,6 +94,11 @@ class Fissure:
     def unexplained(self, is_cut: bool) -> float:
         """Share of the gas's border that came from inside the lung and, if the lung is cut, not from the sheet."""
         return self.gas * (1 - self.gas_share * is_cut) / max(self.border, 1)
+
+    @property
+    def is_bare(self) -> bool:
+        """Whether a piece is told too little to be cut off, though two kinds of evidence support that."""
+        return self.bare_mm > COVERED_MM
 
     @property
     def evidence(self) -> tuple[str, ...]:

@@ -21,7 +21,7 @@ from registration.correspondences import Correspondences
 from registration.images.resample import resample_mask
 from registration.volume import Array, Mask
 from vatsloc.maps import MeshMap, covered
-from vatsloc.workflow.fissures import Fissure, Parted, mapped, smooth_map
+from vatsloc.workflow.fissures import COVERED_MM, Fissure, Parted, mapped, smooth_map
 from vatsloc.workflow.hold_out import held_out
 from vatsloc.workflow.model_selection import GAIN, Refinement, fit_settings, misfit
 from vatsloc.workflow.observe import Observed
@@ -38,9 +38,6 @@ JOINED_MM = 20.0
 """About the hilum, pieces share their nodes."""
 COARSE_MM = 2.0
 DEGREES, STRAINS = (1, 2), (0.05, 0.0125)
-COVERED_MM = 30.0
-"""How far half of a piece may lie from its own keypoints: farther off nothing tells where it went, and held-out
-keypoints, which lie near others, do not notice."""
 LEAST_STRETCH = 0.1
 """Smallest det of the gradient of a map that a piece may be laid out by."""
 
@@ -63,7 +60,7 @@ def in_pieces(
         return pose, collapse
     with stages.stage(PIECES):
         fissure = seen_fissure(pose, collapse)
-    if fissure is None or len(fissure.evidence) < 2 or fissure.bare_mm > COVERED_MM:
+    if fissure is None or len(fissure.evidence) < 2 or fissure.is_bare:
         stages.skip(PIECES, _why(fissure))
         return pose, replace(collapse, fissure=fissure)
     with stages.stage(f"{PIECES}, fit"):
