@@ -6,7 +6,9 @@ is.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import count, islice
 
 import numpy as np
 from scipy.sparse import diags
@@ -90,11 +92,22 @@ def elastic_correction(
     robust: float = 3.0,
     rounds: int = 5,
 ) -> ElasticCorrection:
-    """Elastic field of least energy that follows the constraints, outliers losing influence (Cauchy).
+    """The last of `rounds` fields of `loosened`.
 
     model_sigma: strain by which a tenth of a litre of the solved state is expected to be wrong; it weighs the
-    tissue's energy against the constraints. The field starts stiff and is loosened round by round, so that outliers
-    show before they are followed.
+    tissue's energy against the constraints.
+    """
+    fields = loosened(mesh, u, tissue, wanted, model_sigma / 2.0 ** (rounds - 1), robust)
+    return next(islice(fields, rounds - 1, None))
+
+
+def loosened(
+    mesh: TetMesh, u: Array, tissue: Tissue, wanted: PointConstraints, stiffest: float, robust: float = 3.0
+) -> Iterator[ElasticCorrection]:
+    """Elastic fields of least energy that follow the constraints, outliers losing influence (Cauchy), without end.
+
+    Each expects twice the strain of the one before, the first `stiffest`, so that outliers show before they are
+    followed.
     """
     where = locate(mesh, wanted.points)
     operator = interpolation_matrix(where, len(u))
@@ -102,17 +115,15 @@ def elastic_correction(
     shape = np.where(axial[:, None, None], wanted.normals[:, :, None] * wanted.normals[:, None, :], np.eye(3))
     anchored = diags(anchor(mesh, tissue)).tocsr()
     influence = _near(where)
-    field = np.zeros_like(u)
-    for number in range(rounds):
-        unit = energy_per_datum(tissue, model_sigma / 2.0 ** (rounds - 1 - number))
+    for number in count():
+        unit = energy_per_datum(tissue, stiffest * 2.0**number)
         penalty = (unit * influence / wanted.sigma_mm**2)[:, None, None] * shape
         matrix, force = point_constraints(operator, penalty, wanted.offset)
         field = constrained(mesh, tissue, (matrix + anchored).tocsr(), force)
         misfit = np.linalg.norm(np.einsum("qij,qj->qi", shape, wanted.offset - operator @ field), axis=1)
         scale = robust * np.maximum(wanted.sigma_mm, 1.4826 * np.median(misfit[influence > 0]))
         influence = _near(where) / (1 + (misfit / scale) ** 2)
-    det_f = np.linalg.det(deformation_gradient(mesh, u + field))
-    return ElasticCorrection(field, det_f, influence)
+        yield ElasticCorrection(field, np.linalg.det(deformation_gradient(mesh, u + field)), influence)
 
 
 def energy_per_datum(tissue: Tissue, model_sigma: float) -> float:

@@ -17,6 +17,7 @@ from vatsloc.workflow.ensemble import perturbation_ensemble
 from vatsloc.workflow.model_selection import (
     NO_ENSEMBLE,
     CollapseModel,
+    Corrections,
     Step,
     corrected,
     fit_settings,
@@ -70,7 +71,7 @@ def _pairs(noise_mm: float = 0.0, smooth: bool = True) -> Correspondences:
 
 
 def _steps() -> dict[str, Step]:
-    return {f"strain {strain:g}": corrected(strain, FitSettings()) for strain in (0.05, 0.0125)}
+    return {f"strain {strain:g}": corrected(strain, Corrections(FitSettings())) for strain in (0.05, 0.0125)}
 
 
 def test_misfit_is_the_median_distance(lung: TetMesh) -> None:
@@ -112,9 +113,15 @@ def test_a_step_that_fails_with_all_pairs_gives_way_to_the_next_best(still: Coll
     everything = len(still.correspondences)
 
     def fails(model: CollapseModel, target: Target, start: Fit) -> CollapseModel:
-        return model if len(target.inflated) == everything else corrected(0.05, FitSettings())(model, target, start)
+        return (
+            model
+            if len(target.inflated) == everything
+            else corrected(0.05, Corrections(FitSettings()))(model, target, start)
+        )
 
-    model, _ = select_refinement({"fails": fails, "holds": corrected(0.0125, FitSettings())}, still, still, surface)
+    model, _ = select_refinement(
+        {"fails": fails, "holds": corrected(0.0125, Corrections(FitSettings()))}, still, still, surface
+    )
     assert {refinement.name: refinement.kept for refinement in model.refinements} == {"fails": False, "holds": True}
     assert np.abs(model.displacement).max() > 1.0
 
@@ -132,7 +139,7 @@ def test_the_standard_deviation_of_keypoints_in_the_settings_reaches_the_correct
     left = []
     for sigma_mm in (0.5, 50.0):
         settings = fit_settings(settings_of("balanced", {"keypoints": {"sigma_mm": sigma_mm}}))
-        found = corrected(0.05, settings)(still, target, still.fit)
+        found = corrected(0.05, Corrections(settings))(still, target, still.fit)
         left.append(misfit(still.system.mesh, found.displacement, still.correspondences))
     assert left[0] < 0.5 * left[1]
 

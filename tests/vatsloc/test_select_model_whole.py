@@ -12,7 +12,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from poro.collapse import StrainMeasure as Strain
 from poro.collapse.choice import StrainChoice
-from poro.fit import FitSettings
 from registration.correspondences import Correspondences
 from tests.vatsloc import ball_scene as scene
 from tests.vatsloc.selection_scene import (
@@ -29,6 +28,7 @@ from vatsloc.workflow import model_selection as module
 from vatsloc.workflow.model_selection import (
     NO_CORRESPONDENCES,
     CollapseModel,
+    Corrections,
     Refinement,
     fit_settings,
     select_model,
@@ -67,12 +67,12 @@ class Selection:
             monkeypatch.setattr(module, name, self._asked(name, answer))
         whole = len(pairs)
 
-        def corrected(_strain: float, data: FitSettings) -> Any:
-            assert data == fit_settings(self.settings)
+        def corrected(_strain: float, fields: Corrections) -> Any:
+            assert fields.settings == fit_settings(self.settings)
             return lambda m, t, s: knows(1.0 if len(t.inflated) == whole else 0.7)(m, t, s)
 
-        def refused(_strain: float, data: FitSettings) -> Any:
-            assert data == fit_settings(self.settings)
+        def refused(_strain: float, fields: Corrections) -> Any:
+            assert fields.settings == fit_settings(self.settings)
             return lambda m, t, s: m
 
         monkeypatch.setattr(module, "corrected", corrected if whole_fields else refused)

@@ -6,7 +6,7 @@ further parameters, fitted to the surface and to keypoints inside the lung. 3. A
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,7 +23,7 @@ from poro.collapse import (
 from poro.collapse import StrainMeasure as Strain
 from poro.collapse.choice import StrainChoice
 from poro.fem import Tissue, neo_hookean
-from poro.fit import Fit, FitSettings, FitStatus, Target, constraints_to, elastic_correction, fit_collapse
+from poro.fit import Fit, FitSettings, FitStatus, Target, constraints_to, fit_collapse, loosened
 from poro.fit.elastic_correction import ElasticCorrection
 from poro.mesh import TetMesh, interpolate, locate
 from registration.correspondences import Correspondences
@@ -40,6 +40,8 @@ from vatsloc.workflow.settings import Settings
 from vatsloc.workflow.stages import Stages
 
 CORRECTION_STRAINS = (0.05, 0.025, 0.0125)
+STIFFEST = 0.0125 / 16
+"""The strain that their series begins with; each field of it expects twice that of the one before."""
 MOST_INVERTED = 0.001
 STRAIN = "finite strain"
 """Name of the choice between linear and finite strain."""
@@ -134,12 +136,14 @@ def refined_model(
             model, training_only = select_refinement(steps, model, training_only, surface, or_trial=True)
     if settings.model.correct:
         with stages.stage("elastic correction"):
-            data = fit_settings(settings)
-            steps = {f"elastic correction, strain {strain:g}": corrected(strain, data) for strain in CORRECTION_STRAINS}
+            fields = Corrections(fit_settings(settings))
+            steps = {
+                f"elastic correction, strain {strain:g}": corrected(strain, fields) for strain in CORRECTION_STRAINS
+            }
             model, training_only = select_refinement(steps, model, training_only, surface)
             if not any(refinement.kept for refinement in model.refinements if refinement.name in steps):
                 steps = {
-                    f"elastic correction, strain {strain:g}, held back": held_back(strain, data)
+                    f"elastic correction, strain {strain:g}, held back": held_back(strain, fields)
                     for strain in CORRECTION_STRAINS
                 }
                 model, training_only = select_refinement(steps, model, training_only, surface)
@@ -229,11 +233,35 @@ def _regional(settings: Settings) -> Step:
     return step
 
 
-def corrected(strain: float, settings: FitSettings) -> Step:
+class Corrections:
+    """Elastic corrections of a model towards a target, from the stiffest one on, as far as they are asked for. Those of
+    the pair that was asked for last are kept.
+    """
+
+    def __init__(self, settings: FitSettings) -> None:
+        self.settings = settings
+        self._of: tuple[CollapseModel, Target] | None = None
+        self._fields: Iterator[ElasticCorrection] = iter(())
+        self._found: list[ElasticCorrection] = []
+
+    def field(self, strain: float, model: CollapseModel, target: Target) -> ElasticCorrection:
+        """The one that expects a strain of STIFFEST times a power of two."""
+        if self._of is None or self._of[0] is not model or self._of[1] is not target:
+            mesh, u = model.system.mesh, model.displacement
+            wanted = constraints_to(target, mesh, u, self.settings)
+            self._of, self._found = (model, target), []
+            self._fields = loosened(mesh, u, model.system.tissue, wanted, STIFFEST)
+        number = round(np.log2(strain / STIFFEST))
+        while len(self._found) <= number:
+            self._found.append(next(self._fields))
+        return self._found[number]
+
+
+def corrected(strain: float, corrections: Corrections) -> Step:
     """An elastic field on top; the model unchanged where that would invert more elements."""
 
     def step(model: CollapseModel, target: Target, _start: Fit) -> CollapseModel:
-        found = _correction(strain, settings, model, target)
+        found = corrections.field(strain, model, target)
         inverted, before = ((det <= 0).mean() for det in (found.det_f, model.fit.state.det_f))
         if inverted > max(before, MOST_INVERTED):
             return model
@@ -242,18 +270,12 @@ def corrected(strain: float, settings: FitSettings) -> Step:
     return step
 
 
-def held_back(strain: float, settings: FitSettings) -> Step:
+def held_back(strain: float, corrections: Corrections) -> Step:
     """The same field, made smaller at the nodes of elements that it would invert."""
 
     def step(model: CollapseModel, target: Target, _start: Fit) -> CollapseModel:
         now, mesh = model.displacement, model.system.mesh
-        field = unfolded(mesh.points + now, _correction(strain, settings, model, target).u, mesh.tets)
+        field = unfolded(mesh.points + now, corrections.field(strain, model, target).u, mesh.tets)
         return replace(model, displacement=now + field)
 
     return step
-
-
-def _correction(strain: float, settings: FitSettings, model: CollapseModel, target: Target) -> ElasticCorrection:
-    mesh = model.system.mesh
-    wanted = constraints_to(target, mesh, model.displacement, settings)
-    return elastic_correction(mesh, model.displacement, model.system.tissue, wanted, strain)
