@@ -1,7 +1,5 @@
-"""The scene of an inspiration: an expired lung that fills the inspired cavity, sliding on its wall.
-
-What acts besides is what acts in `elastic`, turned round: as the lung fills, the weight that it had sagged by lessens,
-bronchi hold it lengthwise and the front rises with the ribs.
+"""The scene of an inspiration: an expired lung that fills the inspired cavity, sliding on its wall, and guided by what
+is known of its way.
 """
 
 from __future__ import annotations
@@ -61,15 +59,13 @@ class Inflating:
         )
 
 
-def inflating(lung: Lung, acting: Breathing, known: ConstraintTerms | None = None) -> Inflating:
-    """The scene of a lung's inspiration, of neo-Hookean tissue; known: constraints at the end of the way that guide it
-    besides.
-    """
+def inflating(lung: Lung, known: ConstraintTerms | None = None) -> Inflating:
+    """The scene of a lung's inspiration, of neo-Hookean tissue; known: constraints at its end that guide it."""
     mesh, border = lung.expired, lung.expired.boundary
     expired, inspired = (level_set(mesh.boundary, STEP_MM, SMOOTH_MM) for mesh in (lung.expired, lung.inspired))
     start = expired.evaluate(border.points)[0]
-    matrix, load = rising(lung, acting, TISSUE)
-    acts = ConstraintTerms(matrix, load) if known is None else ConstraintTerms(matrix, load) + known
+    acts = ConstraintTerms(diags(np.repeat(_anchor(mesh, TISSUE), 3)).tocsr(), np.zeros_like(mesh.points))
+    acts = acts if known is None else acts + known
     return Inflating(
         mesh,
         neo_hookean(TISSUE),
@@ -84,7 +80,7 @@ def inflating(lung: Lung, acting: Breathing, known: ConstraintTerms | None = Non
 
 def rising(lung: Lung, acting: Breathing, tissue: Tissue) -> tuple[csr_matrix, Array]:
     """Stiffness (3n, 3n) of what holds the expired lung's bronchi, and forces (n, 3) kPa mm2 at the end of its
-    inspiration: the weight that no longer sags it, and the front's rise with the ribs.
+    inspiration: the weight that no longer sags it, and the front's rise with the ribs, as in `elastic` turned round.
     """
     mesh = lung.expired
     root = hilum(mesh, lung.side)
@@ -94,5 +90,10 @@ def rising(lung: Lung, acting: Breathing, tissue: Tissue) -> tuple[csr_matrix, A
     load = np.zeros_like(mesh.points)
     load[:, 2] = -held * caudal(lung.inspired) * acting.turn * lost / (1 - lost) * (mesh.points[:, 1] - root[1])
     load[:, 1] = acting.mass_kg * 1e9 * GRAVITY_KPA_PER_MM * mesh.node_volumes / mesh.volumes.sum()
-    anchor = 1e-6 * tissue.young_kpa * np.cbrt(mesh.node_volumes)
+    anchor = _anchor(mesh, tissue)
     return diags(np.column_stack([anchor, anchor, anchor + held]).ravel()).tocsr(), load
+
+
+def _anchor(mesh: TetMesh, tissue: Tissue) -> Array:
+    """Stiffness (n,) kPa mm too faint to be felt, which keeps a lung that slides all round from drifting."""
+    return np.asarray(1e-6 * tissue.young_kpa * np.cbrt(mesh.node_volumes))

@@ -8,7 +8,7 @@ from breathing_shapes import pear
 from numpy.testing import assert_allclose
 
 from poro.breathing.cavity import inflating
-from poro.breathing.elastic import WALL_ALONE, Lung
+from poro.breathing.elastic import Lung
 from poro.breathing.guide import guide
 from poro.breathing.inflation import fill
 from poro.breathing.one_scan import one_scan
@@ -41,7 +41,7 @@ def test_a_driver_follows_what_is_known(driver: str) -> None:
         scene = one_scan(rest, "right").guided(known, breath)
         u = scene.states([float(rest.volumes.sum()) + breath])[0].u
     else:
-        filling = inflating(Lung("right", goal, rest), WALL_ALONE, known)
+        filling = inflating(Lung("right", goal, rest), known)
         u = list(fill(filling.at, [0.5, 1.0], filling.volume, filling.guess))[-1].u
     left = np.linalg.norm(u - motion, axis=1)
     assert left.mean() < 0.15 * np.linalg.norm(motion, axis=1).mean()

@@ -12,7 +12,7 @@ from poro.arrays import Array
 from poro.breathing import one_scan as module
 from poro.breathing.cavity import TISSUE as TISSUE_OF_LUNG
 from poro.breathing.cavity import inflating
-from poro.breathing.elastic import WALL_ALONE, Lung
+from poro.breathing.elastic import Lung
 from poro.breathing.equilibrium import Balance, Cavity, ConstraintTerms, Scene, _tissue, balance, volume
 from poro.breathing.inflation import Filled, _swelling, fill, fill_to
 from poro.breathing.one_scan import _wall, one_scan, regions
@@ -83,7 +83,7 @@ def test_a_printed_scene_leaves_its_elimination_tree_out() -> None:
 
 def test_a_lung_fills_its_cavity_and_stays_within() -> None:
     expired, inspired = pear(), pear(stretch=np.array([1.05, 1.1, 1.15]))
-    scene = inflating(Lung("right", inspired, expired), WALL_ALONE)
+    scene = inflating(Lung("right", inspired, expired))
     phases = list(fill(scene.at, [0.5, 1.0], scene.volume, scene.guess))
     for share, phase in zip((0.5, 1.0), phases, strict=True):
         assert phase.volume_mm3 == pytest.approx(scene.volume(share), rel=0.02)
@@ -101,7 +101,7 @@ def test_a_lung_fills_its_cavity_and_stays_within() -> None:
 
 def test_the_inflation_of_a_lung_settles_step_by_step() -> None:
     expired, inspired = pear(), pear(stretch=np.array([1.05, 1.1, 1.15]))
-    scene = inflating(Lung("right", inspired, expired), WALL_ALONE)
+    scene = inflating(Lung("right", inspired, expired))
     phases = list(fill(scene.at, [0.5, 1.0], scene.volume, scene.guess))
     assert all(phase.settled for phase in phases)
     assert max(phase.steps for phase in phases) < 9

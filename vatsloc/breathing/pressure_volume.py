@@ -2,11 +2,15 @@
 
 The pressure follows the volume: at every phase the lung has the phase's volume, and its tissue's stiffness is set by
 one number, so that at the end of inspiration the pressure is what the pressure-volume curve says.
+
+Tissue is even in a full lung and uneven in an emptied one, so how much each part fills is told by the inspired lung
+emptied; where there are two images, by their registration. Ref: Milic-Emili 1966 (regional volumes).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -14,18 +18,19 @@ import numpy as np
 
 from poro.arrays import Array
 from poro.breathing.cavity import TISSUE, Inflating, inflating
-from poro.breathing.elastic import WALL_ALONE, acting_at
+from poro.breathing.elastic import acting_at, breathe_out
 from poro.breathing.inflation import fill
 from poro.breathing.mesh_quality import Shares, smooth, violations
 from poro.breathing.pressure_volume import pressure_volume, recoil_pa
 from vatsloc.breathing.case import BreathCase
-from vatsloc.breathing.lungs import both_scans
+from vatsloc.breathing.lungs import Pair, both_scans, meshed
 from vatsloc.breathing.motion import IN, LungMotion, Motion, between, shares
-from vatsloc.breathing.registered import as_motion, register
+from vatsloc.breathing.registered import Registered, as_motion, register
 
 EDGE_MM = 16.0
-EQUILIBRIA = 3
-"""How many are computed; phases between lie on a line from one to the next."""
+"""Of the lung that is inflated; the one that is emptied has the finer mesh of driver `surface`."""
+EQUILIBRIA = 2
+"""How many are computed; phases between lie on a line from one to the next, which none left by over 0.7 mm."""
 FULL = 0.99
 """Share of the way to the inspired volume at which the lung stops: corners of the cavity it would only fill at any
 pressure."""
@@ -33,19 +38,14 @@ pressure."""
 
 def drive(case: BreathCase, count: int, say: Callable[[str], None]) -> Motion:
     """From expiration to inspiration in `count` phases of equal volume steps."""
-    pairs, notes = both_scans(case, EDGE_MM)
+    pairs, notes = both_scans(case)
     progress = shares(count)
     knots = shares(min(count, EQUILIBRIA + 1))
     lungs, pressures, quality = [], [], []
     found = register(case, pairs, say)
     for number, pair in enumerate(pairs):
         say(f"{pair.side} lung: {len(knots) - 1} equilibria of its inflation ...")
-        # What acts is supposed of a lung of which shapes alone are known.
-        scene = (
-            inflating(pair.lung, acting_at(pair.depth))
-            if found is None
-            else inflating(pair.lung, WALL_ALONE, found[number].inward())
-        )
+        scene = _scene(pair, breathe_out(pair.lung, acting_at(pair.depth)) if found is None else found[number].expired)
         phases = list(fill(scene.at, knots[1:].tolist(), partial(_volume, scene), scene.guess))
         u = np.stack([np.zeros_like(scene.mesh.points), *(phase.u for phase in phases)])
         states = tuple(scene.mesh.points + between(u, knots, s) for s in progress)
@@ -65,6 +65,12 @@ def drive(case: BreathCase, count: int, say: Callable[[str], None]) -> Motion:
     }
     pressure = tuple(float(p) for p in stiffness * by_tissue)
     return Motion("pressure-volume", IN, tuple(lungs), pressure, count - 1, tuple(notes), details, as_motion(found))
+
+
+def _scene(pair: Pair, emptied: Array) -> Inflating:
+    """A lung's inspiration, guided back along the way on which its inspired nodes came to `emptied` (n, 3)."""
+    lung = replace(pair.lung, expired=meshed(pair.expired, EDGE_MM))
+    return inflating(lung, Registered(replace(pair, lung=lung), emptied).inward())
 
 
 def _volume(scene: Inflating, share: float) -> float:

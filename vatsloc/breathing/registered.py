@@ -33,7 +33,7 @@ FAR_MM = 12.0
 
 @dataclass(frozen=True)
 class Registered:
-    """One lung's nodes: inspired mesh, and where the images show its nodes (n, 3) in the expiration, RAS mm."""
+    """One lung's nodes: inspired mesh, and its nodes (n, 3) in the expiration, RAS mm, as the images show them."""
 
     pair: Pair
     expired: Array
