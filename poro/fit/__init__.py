@@ -6,7 +6,7 @@ places are, `identifiability` how well each parameter is held; `elastic_correcti
 
 from poro.fit.collapse_fit import Fit, FitStatus, fit_collapse
 from poro.fit.covariance import ellipsoid95, point_covariance
-from poro.fit.elastic_correction import PointConstraints, constraints_to, elastic_correction, loosened
+from poro.fit.elastic_correction import PointConstraints, constraints_to, elastic_correction
 from poro.fit.identifiability import Identifiability, identifiability
 from poro.fit.observations import Target
 from poro.fit.problem import FitSettings
@@ -23,6 +23,5 @@ __all__ = [
     "ellipsoid95",
     "fit_collapse",
     "identifiability",
-    "loosened",
     "point_covariance",
 ]

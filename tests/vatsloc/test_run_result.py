@@ -50,8 +50,9 @@ def result(found: Localization) -> ResultData:
 def both_scans(case: Case, found: Localization, field_mm: float) -> tuple[Carried, Carried]:
     """What a run makes of the inflated and of the deflated scan, fields on voxels `field_mm` apart."""
     settings = settings_of("balanced", {"output": {"field_mm": field_mm}})
-    assert case.cbct_inflated is not None
-    return _in_inflated(case, case.cbct_inflated, found, settings), _in_deflated(case, found, settings)
+    inflated = _in_inflated(case, found, settings)
+    assert inflated is not None
+    return inflated, _in_deflated(case, found, settings)
 
 
 def stages() -> Stages:

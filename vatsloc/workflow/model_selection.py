@@ -23,8 +23,8 @@ from poro.collapse import (
 from poro.collapse import StrainMeasure as Strain
 from poro.collapse.choice import StrainChoice
 from poro.fem import Tissue, neo_hookean
-from poro.fit import Fit, FitSettings, FitStatus, Target, constraints_to, fit_collapse, loosened
-from poro.fit.elastic_correction import ElasticCorrection
+from poro.fit import Fit, FitSettings, FitStatus, Target, constraints_to, fit_collapse
+from poro.fit.elastic_correction import ElasticCorrection, loosened
 from poro.mesh import TetMesh, interpolate, locate
 from registration.correspondences import Correspondences
 from registration.volume import Array

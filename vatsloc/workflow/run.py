@@ -81,8 +81,8 @@ def run_case(
             stages.warn(sentence)
         known = None if state is None else _taken_up(state, case, settings, stages)
         found = localize(case, settings, stages, known)
-        if case.cbct_inflated is not None:
-            stages.begin(WARP, INFLATED, partial(_in_inflated, case, case.cbct_inflated, found, settings))
+        to_inflated = partial(_in_inflated, case, found, settings)
+        stages.begin(WARP, INFLATED, to_inflated)
         record = _record(case, found, settings, stages)
         answer = write_answer(unfinished, record, found.nodule_def)
         if answered is not None:
@@ -90,9 +90,7 @@ def run_case(
         with stages.stage(WARP, DEFLATED):
             deflated = _in_deflated(case, found, settings)
         with stages.stage(WARP, INFLATED):
-            inflated = None
-            if case.cbct_inflated is not None:
-                inflated = stages.done(partial(_in_inflated, case, case.cbct_inflated, found, settings))
+            inflated = stages.done(to_inflated)
         with stages.stage("write"):
             result = _result(case, found, inflated, deflated, record)
             objects, why = dicom_of_run(folder, result)
@@ -119,8 +117,9 @@ def _taken_up(folder: Path, case: Case, settings: Settings, stages: Stages) -> S
     return known
 
 
-def _in_inflated(case: Case, scan: Volume, found: Localization, settings: Settings) -> Carried:
-    return carried(case.ct, found.prepared.lung_ct, found.pose.inf_from_ct, scan.grid, settings.output.field_mm)
+def _in_inflated(case: Case, found: Localization, settings: Settings) -> Carried | None:
+    lung, there, scan = found.prepared.lung_ct, found.pose.inf_from_ct, case.cbct_inflated
+    return None if scan is None else carried(case.ct, lung, there, scan.grid, settings.output.field_mm)
 
 
 def _in_deflated(case: Case, found: Localization, settings: Settings) -> Carried:
