@@ -28,7 +28,7 @@ def _scene(jump_mm: float, seed: int = 1, count: int = 400) -> tuple[np.ndarray,
 
 def test_keypoints_and_gas_tell_the_sheet() -> None:
     points, motion, gas = _scene(15.0)
-    found = find_fissure(points, motion, gas, HILUM, 5000)
+    found = find_fissure(points, motion, gas, HILUM, 2000)
     assert found is not None
     assert found.evidence == ("keypoints", "gas")
     clear = np.abs(TRUE.distance(points)) > 4.0
@@ -67,6 +67,8 @@ def test_few_keypoints_tell_nothing() -> None:
         (Fissure(TRUE, 0.95, 40, 0.66, 400), ("gas",)),
         (Fissure(TRUE, 0.95, 39, 0.67, 400), ()),
         (Fissure(TRUE, 0.96, 40, 0.67, 400), ("gas",)),
+        (Fissure(TRUE, 0.75, 60, 0.6, 2000), ("keypoints", "gas")),
+        (Fissure(TRUE, 0.75, 59, 0.6, 2000), ("keypoints",)),
     ],
 )
 def test_evidence_has_limits(fissure: Fissure, evidence: tuple[str, ...]) -> None:

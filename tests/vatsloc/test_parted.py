@@ -269,7 +269,8 @@ def in_one_piece(
     [
         (None, "too few keypoints to tell pieces apart"),
         (replace(FLAT, cost_share=0.97), "two smooth maps cost 0.97 of one at keypoints"),
-        (replace(FLAT, gas=10), "of 10 points of gas lie along a sheet"),
+        (replace(FLAT, gas=10), "of 10 points of gas, 5.0 % of its border, lie along a sheet"),
+        (replace(FLAT, border=4000), "90 % of 100 points of gas, 2.5 % of its border,"),
         (replace(FLAT, gas_share=0.3), "30 % of 100 points of gas"),
         (replace(FLAT, bare_mm=30.4), "half of a piece would lie over 30 mm from its own keypoints, 30 allowed"),
     ],

@@ -29,7 +29,9 @@ LEAST_KEYPOINTS = 25
 LEAST_DEEP_MM = 10.0
 """Gas whose border lay so deep below the pleura has come into the lung."""
 BESIDE_MM = 8.0
-LEAST_GAS, LEAST_GAS_SHARE = 40, 0.6
+LEAST_GAS, LEAST_GAS_OF_BORDER, LEAST_GAS_SHARE = 40, 0.03, 0.6
+"""Points of gas that there have to be, also as a share of the gas's border, of which a few are always carried back too
+deep, and their share beside the sheet."""
 MOST_COST = 0.75
 """Of the cost of one smooth map, what two have to come down to."""
 CLEAR_GAS_SHARE, MOST_COST_BESIDE_IT = 2 / 3, 0.95
@@ -103,7 +105,8 @@ class Fissure:
     @property
     def evidence(self) -> tuple[str, ...]:
         """What supports a cut: "keypoints", "gas"."""
-        parted = self.gas >= LEAST_GAS and self.gas_share >= LEAST_GAS_SHARE
+        enough = self.gas >= max(LEAST_GAS, LEAST_GAS_OF_BORDER * self.border)
+        parted = enough and self.gas_share >= LEAST_GAS_SHARE
         most_cost = MOST_COST_BESIDE_IT if parted and self.gas_share >= CLEAR_GAS_SHARE else MOST_COST
         return (*(("keypoints",) if self.cost_share <= most_cost else ()), *(("gas",) if parted else ()))
 

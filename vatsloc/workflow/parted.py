@@ -82,7 +82,8 @@ def _why(fissure: Fissure | None) -> str:
     if len(fissure.evidence) == 2:
         return f"half of a piece would lie over {fissure.bare_mm:.0f} mm from its own keypoints, {COVERED_MM:g} allowed"
     cost, share = f"{fissure.cost_share:.2f}", f"{100 * fissure.gas_share:.0f} %"
-    return f"two smooth maps cost {cost} of one at keypoints, {share} of {fissure.gas} points of gas lie along a sheet"
+    gas = f"{fissure.gas} points of gas, {100 * fissure.gas / max(fissure.border, 1):.1f} % of its border,"
+    return f"two smooth maps cost {cost} of one at keypoints, {share} of {gas} lie along a sheet"
 
 
 def cut_lung(prepared: Prepared, fissure: Fissure, edge_mm: float) -> Pieces:
