@@ -117,13 +117,15 @@ def test_pairs_that_are_there_are_not_run_again(monkeypatch: pytest.MonkeyPatch,
     def measured(folder: Path, variants: Mapping[str, Any]) -> Iterator[Row]:
         for name in variants:
             ran.append((folder.name, name))
-            yield Row(name, folder.name, 1.0)
+            yield Row(name, folder.name, chain_mean=0.5, chain_cpu=30.0)
 
     monkeypatch.setattr(chart, "measure_case", measured)
     monkeypatch.setattr(chart, "warm_up", lambda folder: ran.append((folder.name, "warm")))
     cases = [tmp_path / "a", tmp_path / "b"]
     some = chosen_variants(["fast", "balanced"])
-    assert len(run_chart(cases[:1], some, tmp_path)) == 2
+    said: list[str] = []
+    assert len(run_chart(cases[:1], some, tmp_path, said.append)) == 2
+    assert said[1:] == ["a, fast: chain 0.50 mm, 30 s", "a, balanced: chain 0.50 mm, 30 s"]
     rows = run_chart(cases, chosen_variants(["balanced", "rigid"]), tmp_path)
     assert ran[:3] == [("a", "warm"), ("a", "fast"), ("a", "balanced")]
     assert ran[3:] == [("a", "warm"), ("a", "rigid"), ("b", "balanced"), ("b", "rigid")]

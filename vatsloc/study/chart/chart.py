@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import astuple, dataclass, field, fields, replace
@@ -89,11 +90,13 @@ def run_chart(cases: Sequence[Path], variants: Mapping[str, Variant], out: Path,
             warm = True
         for row in measure_case(folder, missing):
             append_row(out / RUNS, row)
-            say(
-                f"{name}, {row.variant}: "
-                + (row.failed or f"phase 1 {row.phase1_mean:.2f}, chain {row.chain_mean:.2f} mm, {row.chain_cpu:.0f} s")
-            )
+            say(f"{name}, {row.variant}: {row.failed or _errors(row)}")
     return read_rows(out / RUNS)
+
+
+def _errors(row: Row) -> str:
+    first = "" if math.isnan(row.phase1_mean) else f"phase 1 {row.phase1_mean:.2f}, "
+    return f"{first}chain {row.chain_mean:.2f} mm, {row.chain_cpu:.0f} s"
 
 
 def warm_up(folder: Path) -> None:
