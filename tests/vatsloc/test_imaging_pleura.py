@@ -8,8 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 
+from registration.images.resample import resample_mask
 from registration.volume import Mask, Volume
 from tests.vatsloc import imaging_thorax as known
 from vatsloc.case import read_case
@@ -19,7 +20,15 @@ from vatsloc.imaging.hilum import track_hilum
 from vatsloc.imaging.lungs import segment_lungs
 from vatsloc.imaging.pleura import Pneumothorax, _large_pieces, _local_limit, _lung_beside, air_limit, find_pneumothorax
 from vatsloc.imaging.surface import Border, deflated_surface, diaphragm_points, inflated_surface
-from vatsloc.imaging.thorax import ThoraxPrior, carry_prior, inflated_lung, require_share, visible_share
+from vatsloc.imaging.thorax import (
+    ThoraxPrior,
+    carry_prior,
+    central_airways,
+    inflated_lung,
+    require_share,
+    visible_share,
+    working_scene,
+)
 
 SHRUNK = 0.72
 
@@ -50,6 +59,19 @@ def deflated() -> PreparedCbct:
 @pytest.fixture(scope="module")
 def found(deflated: PreparedCbct, prior: ThoraxPrior) -> Pneumothorax:
     return find_pneumothorax(deflated, prior)
+
+
+def test_what_is_expected_is_not_written_to(deflated: PreparedCbct, prior: ThoraxPrior) -> None:
+    """The hilum's motion reads it at the same time on another thread."""
+    grid = working_scene(deflated)[0].grid
+    there = ThoraxPrior(*(resample_mask(mask, grid) for mask in (prior.lung, prior.other, prior.airways)))
+    before = [mask.inside.copy() for mask in (there.lung, there.other, there.airways)]
+    central = central_airways(there, grid)
+    assert 0 < central.sum() < before[2].sum()
+    assert not (central & ~before[2]).any()
+    find_pneumothorax(deflated, there)
+    for mask, inside in zip((there.lung, there.other, there.airways), before, strict=True):
+        assert_array_equal(mask.inside, inside)
 
 
 def test_inflated_lung_matches_in_spite_of_a_displaced_prior() -> None:

@@ -20,6 +20,8 @@ from vatsloc.imaging.lungs import Lungs, Side
 SPACING_MM = 2.0
 AERATED_HU = -350.0
 LEAST_SHARE = 0.40
+DEEP_MM = 6.0
+"""Below a lung's surface; bronchi there go with the lung."""
 
 
 @dataclass(frozen=True)
@@ -74,15 +76,21 @@ def working_scene(cbct: PreparedCbct) -> tuple[Volume, Array]:
     return work, on_grid(cbct.field.mask.inside, cbct.volume.grid, work.grid).inside
 
 
+def central_airways(prior: ThoraxPrior, grid: Grid) -> Array:
+    """Which voxels of a grid are expected to be airways and not deep in a lung, where a collapse moves them far."""
+    lung, other, tubes = (_on(m, grid) for m in (prior.lung, prior.other, prior.airways))
+    deep = [erode(inside, DEEP_MM, grid.spacing) for inside in (lung, other)]
+    return np.asarray(tubes & ~deep[0] & ~deep[1])
+
+
 def lung_space(work: Volume, seen: Array, prior: ThoraxPrior) -> tuple[Array, TrackedAirways]:
     """Aerated voxels of the operated side, its lung and the air around it when it has collapsed; and the airways.
 
     Aerated regions are cut at their necks, every core goes to the prior it overlaps most, and cores grow back together.
     """
     spacing = work.grid.spacing
-    lung, other, tubes = (_on(m, work.grid) for m in (prior.lung, prior.other, prior.airways))
-    tubes &= ~erode(lung, 6.0, spacing) & ~erode(other, 6.0, spacing)
-    airways = track_airways(work, seen, tubes)
+    lung, other = (_on(m, work.grid) for m in (prior.lung, prior.other))
+    airways = track_airways(work, seen, central_airways(prior, work.grid))
     near = dilate(lung, 15.0, spacing) | dilate(other, 10.0, spacing)
     aerated = (work.hu < AERATED_HU) & seen & near & ~dilate(airways.inside, 2.5, spacing)
     depth = ndimage.distance_transform_edt(aerated, sampling=spacing)

@@ -11,7 +11,7 @@ from poro.mesh import TetMesh, TriSurface, stuff
 from registration.images.resample import resample_mask
 from registration.maps.rigid import RigidTransform
 from registration.spine import RigidFit, register_spine
-from registration.volume import Array
+from registration.volume import Array, Mask
 from vatsloc.case import Case
 from vatsloc.errors import InputRefused
 from vatsloc.imaging.hilum import Hilum, find_hilum
@@ -19,7 +19,7 @@ from vatsloc.imaging.lattice import working_copy
 from vatsloc.imaging.pleura import Pneumothorax, find_pneumothorax
 from vatsloc.imaging.side import Seen
 from vatsloc.imaging.surface import Border, SurfacePoints, deflated_surface
-from vatsloc.imaging.thorax import SPACING_MM, ThoraxPrior
+from vatsloc.imaging.thorax import SPACING_MM, ThoraxPrior, central_airways
 from vatsloc.maps import MeshMap, covered, sampled
 from vatsloc.workflow.hilum import HilumMotion, HilumSource, hilum_motion
 from vatsloc.workflow.pose import ChangeOfPose, as_side
@@ -141,7 +141,9 @@ def _motion(
 ) -> HilumMotion:
     if not settings.model.hilum:
         return HilumMotion(np.zeros_like(points), HilumSource.OFF)
-    return hilum_motion(prepared.inflated, prepared.deflated, prior.airways, hilum, def_from_inf.inverse(), points)
+    grid = prior.airways.grid
+    airways = Mask(central_airways(prior, grid), grid.ras_from_ijk)
+    return hilum_motion(prepared.inflated, prepared.deflated, airways, hilum, def_from_inf.inverse(), points)
 
 
 def _hinted_surface(case: Case) -> SurfacePoints | None:
