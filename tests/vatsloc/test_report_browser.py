@@ -20,7 +20,7 @@ from registration.volume import Volume
 from tests.vatsloc.browser import CHROMIUM, asked_by_the_page, printed, visit
 from vatsloc.formats.meshes import Surface
 from vatsloc.report.data import Comparison, Landmark, Motion, Nodule, ReportData
-from vatsloc.report.render import write_report
+from vatsloc.report.render import render
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
 
@@ -106,7 +106,7 @@ BOXES = Motion(TRIANGLES, 40 * CORNERS, 20 * CORNERS, Surface(40 * CORNERS, TRIA
 def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     marks = (Landmark("apex", np.array([20.0, 20, 20]), 30.0, True),)
     path = tmp_path_factory.mktemp("page") / "report.html"
-    write_report(path, data(BOXES, marks))
+    path.write_text(render(data(BOXES, marks)), encoding="utf-8")
     return path
 
 
@@ -194,7 +194,7 @@ def ball_page(folder: Path) -> Path:
     points, triangles = np.unique(flat.reshape(-1, 3).round(9), axis=0, return_inverse=True)
     motion = Motion(triangles.reshape(-1, 3), 30 * points, 30 * points, Surface(40 * CORNERS, TRIANGLES), NODULE)
     folder.mkdir()
-    write_report(folder / "report.html", data(motion))
+    (folder / "report.html").write_text(render(data(motion)), encoding="utf-8")
     return folder / "report.html"
 
 
@@ -223,7 +223,8 @@ def test_the_report_prints_on_two_a4_pages_that_say_what_matters(hard: bool, tmp
     names = ["overlap", "check", *(f"gate_{n}" for n in range(19))]
     gates = {name: {"ok": not hard, "value": 0.5, "limit": 0.4, "says": SAYS} for name in names}
     warnings = [f"Warning {n}: " + "what the reader of a result has to know, " * 6 for n in range(30)] if hard else []
-    write_report(tmp_path / "report.html", data(BOXES, gates=gates, warnings=warnings))
+    page = render(data(BOXES, gates=gates, warnings=warnings))
+    (tmp_path / "report.html").write_text(page, encoding="utf-8")
     pdf = PdfReader(printed(tmp_path / "report.html", tmp_path))
     assert len(pdf.pages) == 2
     for sheet in pdf.pages:

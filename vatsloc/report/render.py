@@ -115,11 +115,6 @@ def render(data: ReportData) -> str:
     )
 
 
-def write_report(path: Path, data: ReportData) -> None:
-    """Write report.html (UTF-8)."""
-    path.write_text(render(data), encoding="utf-8")
-
-
 def write_forecast(path: Path, name: str, told: Mapping[str, Any], picture: Picture, nodule: Nodule) -> None:
     """Write the page of a forecast (UTF-8). told: what foresee.json holds; picture: the CT with the lung."""
     page = _page("forecast.html").render(
