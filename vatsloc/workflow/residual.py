@@ -6,7 +6,6 @@ node is moved where two registrations, forward and backward, agree on its positi
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 
@@ -89,10 +88,8 @@ def residual_registration(
     expected_at = keypoints.mapped(moving=def_from_inf)
     forth, homeward = (expected_at, expected_at.swapped()) if len(keypoints) else (None, None)
     register = partial(register_ffd, settings=ffd, moving_mask=scans.both_see)
-    with ThreadPoolExecutor(max_workers=1) as beside:
-        returning = beside.submit(register, scans.warped, scans.deflated, fixed_mask=expected, matches=homeward)
-        there = register(scans.deflated, scans.warped, fixed_mask=observed, matches=forth)
-        back = returning.result()
+    there = register(scans.deflated, scans.warped, fixed_mask=observed, matches=forth)
+    back = register(scans.warped, scans.deflated, fixed_mask=expected, matches=homeward)
     inverse = invert_at(there.moving_from_fixed, nodes, nodes)
     placed, other = inverse.points_fixed, back.moving_from_fixed(nodes)
     disagreement = np.linalg.norm(placed - other, axis=1)
