@@ -86,7 +86,8 @@ class Parts:
             self.asked.append(values)
             return images
 
-        def ready(compared: Compared, chosen: RefinementSettings) -> Compared:
+        def ready(compared: Compared, rest: TetMesh, chosen: RefinementSettings) -> Compared:
+            assert rest is self.before
             assert chosen == settings.refinement
             return compared
 

@@ -159,9 +159,10 @@ def test_seen_nodes_go_where_the_inverted_field_says_and_the_others_go_on_smooth
 def test_blocks_near_the_pleura_refine_the_pose_and_deep_seen_nodes_stay(watched: Watched) -> None:
     watched.off = np.array([0.5, 1.0, -2.0])
     found = watched.run()
-    compared, settings, _ = watched.asked["prospect"]
+    compared, rest, settings, _ = watched.asked["prospect"]
     prospect, shape = watched.asked["refine_by_blocks"]
     assert prospect is watched.prospect
+    assert rest is shape.rest
     assert (compared.ct, compared.lung_ct) == (watched.case.ct, watched.prepared.lung_ct)
     assert (compared.scan, compared.lung) == (watched.prepared.inflated, watched.lung_inf)
     assert_allclose(shape.rest.points, scene.INF_FROM_CT(found.mesh_ct.points))

@@ -49,7 +49,7 @@ def compared(**other: Any) -> Compared:
 
 
 def test_the_lung_follows_blocks_up_to_the_pleura() -> None:
-    found = refine_by_blocks(prospect(compared(), ON), Lung.shape(np.zeros(0, int)))
+    found = refine_by_blocks(prospect(compared(), Lung.rest, ON), Lung.shape(np.zeros(0, int)))
     before, after = Lung.error(Lung.start), Lung.error(found.points)
     shallow = Lung.depth < 8.0
     assert before[shallow].mean() > 1.8
@@ -101,8 +101,10 @@ def test_without_a_wall_in_reach_nothing_is_drawn() -> None:
 def test_the_wall_brings_the_surface_nearer_than_blocks_alone() -> None:
     border = TetMesh(Lung.truth, Lung.mesh.tets).boundary
     shape = Lung.shape(np.zeros(0, int))
-    alone = refine_by_blocks(prospect(compared(), ON), shape)
-    held = refine_by_blocks(prospect(compared(), ON), replace(shape, wall=wall_of(border.points, border.node_normals)))
+    alone = refine_by_blocks(prospect(compared(), Lung.rest, ON), shape)
+    held = refine_by_blocks(
+        prospect(compared(), Lung.rest, ON), replace(shape, wall=wall_of(border.points, border.node_normals))
+    )
 
     def off_surface(points: Array) -> float:
         return float(np.abs(((points - Lung.truth)[border.nodes] * border.node_normals).sum(axis=1)).mean())
@@ -113,8 +115,8 @@ def test_the_wall_brings_the_surface_nearer_than_blocks_alone() -> None:
 
 def test_anchors_stay_and_deep_blocks_are_left_out() -> None:
     anchors = np.flatnonzero(Lung.depth > 16.0)
-    found = refine_by_blocks(prospect(compared(), ON), Lung.shape(anchors, 16.0))
-    everywhere = refine_by_blocks(prospect(compared(), ON), Lung.shape(np.zeros(0, int)))
+    found = refine_by_blocks(prospect(compared(), Lung.rest, ON), Lung.shape(anchors, 16.0))
+    everywhere = refine_by_blocks(prospect(compared(), Lung.rest, ON), Lung.shape(np.zeros(0, int)))
     assert found.passes[0].blocks < 0.9 * everywhere.passes[0].blocks
     assert Lung.error(found.points)[anchors].max() < 0.15 < Lung.error(everywhere.points)[anchors].max()
     assert Lung.error(found.points)[Lung.depth < 8.0].mean() < 0.6 * Lung.error(Lung.start)[Lung.depth < 8.0].mean()
@@ -124,8 +126,8 @@ def test_blocks_about_a_cut_are_not_followed() -> None:
     def above(points: Array) -> Array:
         return np.asarray((points - scene.CENTRE_CT)[:, 2] - 7.0)
 
-    uncut = refine_by_blocks(prospect(compared(), ON), Lung.shape(np.zeros(0, int)))
-    cut = refine_by_blocks(prospect(compared(), ON), replace(Lung.shape(np.zeros(0, int)), cut=above))
+    uncut = refine_by_blocks(prospect(compared(), Lung.rest, ON), Lung.shape(np.zeros(0, int)))
+    cut = refine_by_blocks(prospect(compared(), Lung.rest, ON), replace(Lung.shape(np.zeros(0, int)), cut=above))
     assert uncut.followed is not None
     assert cut.followed is not None
     assert (np.abs(above(uncut.followed.moving)) < module.BESIDE_CUT_MM).sum() > 20
@@ -138,7 +140,7 @@ def test_of_the_scan_s_points_those_are_followed_that_lie_near_the_pleura_before
     """Points of tissue are taken back to the CT, where the lung is a ball, by maps in closed form."""
     within = 8.0
     mapped = MeshMap(Lung.mesh, Lung.truth, AROUND)
-    everywhere = prospect(compared(), ON.model_copy(update={"cell_mm": 8.0})).points
+    everywhere = prospect(compared(), Lung.rest, ON.model_copy(update={"cell_mm": 8.0})).points
     points, chosen = (
         module._within_reach(everywhere, Shape(Lung.rest, mapped, np.zeros(0, int), reach))
         for reach in (np.inf, within)
@@ -162,7 +164,7 @@ def test_a_lung_that_is_right_is_left_as_it_is(monkeypatch: pytest.MonkeyPatch) 
 
     monkeypatch.setattr(module, "match_aligned", scattered)
     shape = Shape(Lung.rest, MeshMap(Lung.mesh, Lung.truth, AROUND), np.zeros(0, int))
-    found = refine_by_blocks(prospect(compared(), ON), shape)
+    found = refine_by_blocks(prospect(compared(), Lung.rest, ON), shape)
     assert [one.kept for one in found.passes] == [False, False]
     assert all(one.blocks == 400 and one.after_mm >= one.before_mm for one in found.passes)
     assert_array_equal(found.points, Lung.truth)
@@ -175,7 +177,7 @@ def test_where_too_few_blocks_are_found_nothing_moves(lost: str) -> None:
     if lost == "lung_ct":
         inside[tuple(np.argwhere(mask.inside)[0])] = True
     found = refine_by_blocks(
-        prospect(compared(**{lost: Mask(inside, mask.ras_from_ijk)}), ON), Lung.shape(np.zeros(0, int))
+        prospect(compared(**{lost: Mask(inside, mask.ras_from_ijk)}), Lung.rest, ON), Lung.shape(np.zeros(0, int))
     )
     assert found.passes == ()
     assert_array_equal(found.points, Lung.start)

@@ -8,7 +8,6 @@ from functools import partial
 import numpy as np
 
 from poro.collapse import PoroSystem
-from poro.fem import Tissue, prepare_solid
 from poro.fit import Fit, Identifiability, identifiability
 from poro.mesh import TetMesh, TriSurface, interpolate, locate
 from registration.maps.rigid import RigidTransform
@@ -142,8 +141,8 @@ def refined(
 
 def _prospect(case: Case, prepared: Prepared, observed: Observed, settings: Settings) -> Prospect:
     """What is ready for the refinement by blocks as soon as the collapsed lung is found."""
-    prepare_solid(observed.mesh_before, Tissue())
-    return prospect(Compared(case.ct, prepared.lung_ct, prepared.deflated, observed.found.lung), settings.refinement)
+    compared = Compared(case.ct, prepared.lung_ct, prepared.deflated, observed.found.lung)
+    return prospect(compared, observed.mesh_before, settings.refinement)
 
 
 def _residual(

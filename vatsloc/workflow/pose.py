@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 from scipy import ndimage
 
-from poro.fem import Extrapolation, Tissue, extrapolate, prepare_solid
+from poro.fem import Extrapolation, Tissue, extrapolate
 from poro.mesh import TetMesh, closest_points, stuff
 from poro.mesh.tetmesh import signed_volumes
 from registration.ffd import FfdFit, FfdSettings, Weights
@@ -26,7 +26,7 @@ from vatsloc.imaging.thorax import carry_prior, inflated_lung, require_share, vi
 from vatsloc.maps import MeshMap
 from vatsloc.workflow.choices import Choice, weigh
 from vatsloc.workflow.prepare import PreparedBefore
-from vatsloc.workflow.refinement import BlockRefinement, Compared, Prospect, Shape, prospect, refine_by_blocks
+from vatsloc.workflow.refinement import BlockRefinement, Compared, Shape, prospect, refine_by_blocks
 from vatsloc.workflow.settings import RegistrationSettings, Settings
 from vatsloc.workflow.stages import CT, INFLATED, Stages
 
@@ -115,8 +115,10 @@ def change_of_pose(
     with stages.stage("mesh", CT):
         mesh = stuff(prepared.lung_ct.inside, prepared.lung_ct.ras_from_ijk, settings.mesh.edge_mm)
     placed = TetMesh(inf_from_ct_rigid(mesh.points), mesh.tets)
+    compared = Compared(case.ct, prepared.lung_ct, prepared.inflated, lung_inf)
+    ready = partial(prospect, compared, placed, settings.refinement)
     if settings.registration.on and settings.refinement.on:
-        stages.begin(REFINEMENT, "", partial(_prospect, case, prepared, lung_inf, placed, settings))
+        stages.begin(REFINEMENT, "", ready)
     stages.fail_early()  # before what takes long
     if not settings.registration.on:
         stages.skip("free-form deformation", "switched off in the settings")
@@ -143,7 +145,7 @@ def change_of_pose(
         with stages.stage(REFINEMENT):
             to_inflated = MeshMap(mesh, points, inf_from_ct_rigid)
             refinement = refine_by_blocks(
-                stages.done(partial(_prospect, case, prepared, lung_inf, placed, settings)),
+                stages.done(ready),
                 Shape(
                     placed,
                     to_inflated,
@@ -167,14 +169,6 @@ def change_of_pose(
         overlap=overlap,
         refinement=refinement,
     )
-
-
-def _prospect(
-    case: CaseBefore, prepared: PreparedBefore, lung_inf: Mask, placed: TetMesh, settings: Settings
-) -> Prospect:
-    """What is ready for the refinement by blocks as soon as the inflated lung is found."""
-    prepare_solid(placed, Tissue())
-    return prospect(Compared(case.ct, prepared.lung_ct, prepared.inflated, lung_inf), settings.refinement)
 
 
 def moved_far(fit: SlidingFit, limit_mm: float) -> Choice:

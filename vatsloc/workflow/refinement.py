@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from poro.fem import Tissue
+from poro.fem import Tissue, prepare_solid
 from poro.fit import PointConstraints, elastic_correction
 from poro.mesh import TetMesh, closest_points
 from poro.mesh.tetmesh import signed_volumes
@@ -163,8 +163,11 @@ def _around(compared: Compared) -> Compared:
     return Compared(ct.part(cut_ct), inner_ct, replace(scan, volume=scan.volume.part(cut)), inner)
 
 
-def prospect(compared: Compared, settings: RefinementSettings) -> Prospect:
-    """What can be made ready before a map from the CT to the scan is known; at most one point a cell."""
+def prospect(compared: Compared, rest: TetMesh, settings: RefinementSettings) -> Prospect:
+    """What can be made ready before a map from the CT to the scan is known; at most one point a cell. rest: as in
+    `Shape`.
+    """
+    prepare_solid(rest, Tissue())
     around = _around(compared)
     lungs = [(coarsen(around.scan.volume, voxel_mm), coarsen(around.ct, voxel_mm)) for voxel_mm, _ in PASSES]
     organs = tuple(
