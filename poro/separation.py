@@ -20,9 +20,9 @@ from poro.contact.facing import Facing
 from poro.contact.levelset import LevelSet
 from poro.fem.constraints import interpolation_matrix, point_constraints
 from poro.fem.forms import stiffness
-from poro.fem.solid import unknowns_of
+from poro.fem.solid import anchor, unknowns_of
 from poro.fem.tissue import Tissue
-from poro.fit.elastic_correction import anchor, energy_per_datum
+from poro.fit.elastic_correction import energy_per_datum
 from poro.linalg.solver import linear_solver
 from poro.mesh.locate import locate
 from poro.mesh.pieces import Pieces

@@ -14,6 +14,7 @@ from poro.breathing.elastic import WALL_KPA_PER_MM, Breathing, Lung, caudal, hil
 from poro.breathing.equilibrium import Cavity, ConstraintTerms, Scene, tree_of
 from poro.contact.levelset import level_set
 from poro.fem.constitutive import ConstitutiveModel, neo_hookean
+from poro.fem.solid import anchor
 from poro.fem.tissue import GRAVITY_KPA_PER_MM, Tissue
 from poro.linalg.dissection import Tree
 from poro.mesh.tetmesh import TetMesh
@@ -64,7 +65,7 @@ def inflating(lung: Lung, known: ConstraintTerms | None = None) -> Inflating:
     mesh, border = lung.expired, lung.expired.boundary
     expired, inspired = (level_set(mesh.boundary, STEP_MM, SMOOTH_MM) for mesh in (lung.expired, lung.inspired))
     start = expired.evaluate(border.points)[0]
-    acts = ConstraintTerms(diags(np.repeat(_anchor(mesh, TISSUE), 3)).tocsr(), np.zeros_like(mesh.points))
+    acts = ConstraintTerms(diags(anchor(mesh, TISSUE)).tocsr(), np.zeros_like(mesh.points))
     acts = acts if known is None else acts + known
     return Inflating(
         mesh,
@@ -90,10 +91,5 @@ def rising(lung: Lung, acting: Breathing, tissue: Tissue) -> tuple[csr_matrix, A
     load = np.zeros_like(mesh.points)
     load[:, 2] = -held * caudal(lung.inspired) * acting.turn * lost / (1 - lost) * (mesh.points[:, 1] - root[1])
     load[:, 1] = acting.mass_kg * 1e9 * GRAVITY_KPA_PER_MM * mesh.node_volumes / mesh.volumes.sum()
-    anchor = _anchor(mesh, tissue)
-    return diags(np.column_stack([anchor, anchor, anchor + held]).ravel()).tocsr(), load
-
-
-def _anchor(mesh: TetMesh, tissue: Tissue) -> Array:
-    """Stiffness (n,) kPa mm too faint to be felt, which keeps a lung that slides all round from drifting."""
-    return np.asarray(1e-6 * tissue.young_kpa * np.cbrt(mesh.node_volumes))
+    along = np.column_stack([np.zeros_like(held), np.zeros_like(held), held]).ravel()
+    return diags(anchor(mesh, tissue) + along).tocsr(), load

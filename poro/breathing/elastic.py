@@ -18,6 +18,7 @@ from poro.breathing.affine import Affine
 from poro.fem import Tissue
 from poro.fem.constraints import point_constraints
 from poro.fem.forms import stiffness
+from poro.fem.solid import anchor
 from poro.fem.tissue import GRAVITY_KPA_PER_MM
 from poro.linalg import linear_solver
 from poro.mesh import TetMesh, closest_points
@@ -98,8 +99,7 @@ def breathe_out(lung: Lung, acting: Breathing) -> Array:
     held, pull = bronchi(lung, acting)
     weight = np.zeros_like(rest.points)
     weight[:, 1] = -acting.mass_kg * 1e9 * GRAVITY_KPA_PER_MM * rest.node_volumes / lung.expired.volumes.sum()
-    anchor = 1e-6 * tissue.young_kpa * np.cbrt(rest.node_volumes)
-    within = stiffness(rest, tissue.lame_kpa, tissue.shear_kpa) + diags(np.repeat(anchor, 3))
+    within = stiffness(rest, tissue.lame_kpa, tissue.shear_kpa) + diags(anchor(rest, tissue))
     within = within + diags(np.column_stack([0 * held, 0 * held, held]).ravel())
     force = weight
     force[:, 2] += held * (lung.inspired.points[:, 2] + pull - rest.points[:, 2])

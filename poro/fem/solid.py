@@ -77,6 +77,11 @@ def constrained(mesh: TetMesh, tissue: Tissue, constraints: csr_matrix, force: A
     return solve_once(matrix, mesh.points, force.ravel(), _tree(mesh, tissue)).reshape(-1, 3)
 
 
+def anchor(mesh: TetMesh, tissue: Tissue) -> Array:
+    """Stiffness (3n,) kPa mm that holds a body where no constraint does; far below any tissue stiffness."""
+    return np.repeat(1e-6 * tissue.young_kpa * np.cbrt(mesh.node_volumes), 3)
+
+
 def prepare_solid(mesh: TetMesh, tissue: Tissue) -> None:
     """Do and keep what `constrained` needs of a mesh and a tissue alone, so that it need not be waited for."""
     _tree(mesh, tissue)

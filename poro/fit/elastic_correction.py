@@ -16,7 +16,7 @@ from scipy.sparse import diags
 from poro.arrays import Array
 from poro.fem.constraints import interpolation_matrix, point_constraints
 from poro.fem.forms import deformation_gradient
-from poro.fem.solid import constrained
+from poro.fem.solid import anchor, constrained
 from poro.fem.tissue import Tissue
 from poro.fit.observations import Target, facing, independence
 from poro.fit.problem import FitSettings
@@ -131,11 +131,6 @@ def energy_per_datum(tissue: Tissue, model_sigma: float) -> float:
     worth, squared and halved.
     """
     return tissue.young_kpa * REGION_MM3 * model_sigma**2
-
-
-def anchor(mesh: TetMesh, tissue: Tissue) -> Array:
-    """Stiffness (3n,) kPa mm that holds a body where no constraint does; far below any tissue stiffness."""
-    return np.repeat(1e-6 * tissue.young_kpa * np.cbrt(mesh.node_volumes), 3)
 
 
 def _near(where: Location) -> Array:
