@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from registration.images.morphology import close
+from registration.images.morphology import close, distances_to
 from registration.images.resample import resample_mask
 from registration.volume import Array, Grid, Mask, Volume
 from vatsloc.errors import InputRefused
@@ -162,10 +162,12 @@ def _halves(inside: Array, grid: Grid) -> dict[Side, Array]:
     x = [grid.to_ras(np.argwhere(seed).mean(axis=0))[0] for seed in seeds]
     right, left = (seeds[n] for n in np.argsort(x)[::-1])
     # Whatever else is left belongs to the lung that it lies nearer to.
-    nearer = ndimage.distance_transform_edt(~right, sampling=grid.spacing) <= ndimage.distance_transform_edt(
-        ~left, sampling=grid.spacing
-    )
-    return {"left": inside & ~nearer, "right": inside & nearer}
+    left_over = np.argwhere(inside & ~(right | left))
+    to_right, to_left = (distances_to(lung, left_over, grid.spacing) for lung in (right, left))
+    right, left = right.copy(), left.copy()
+    for lung, mine in ((right, to_right <= to_left), (left, to_right > to_left)):
+        lung[tuple(left_over[mine].T)] = True
+    return {"left": left, "right": right}
 
 
 def _parted(joined: Array, grid: Grid) -> list[Array]:
