@@ -54,7 +54,8 @@ class Compliance:
         if self._groups is None:
             label = _bisect(points, GROUPS)
             share = 1 / np.bincount(label)
-            motion = _group_means(self.matrix, label, share).reshape(len(label), 3, len(share), 3)
+            sums = _group_sums(self.matrix, label, len(share)) * np.repeat(share, 3)[:, None]
+            motion = sums.T.astype(self.matrix.dtype).reshape(len(label), 3, len(share), 3)
             mean = np.zeros((len(share), *motion.shape[1:]))
             np.add.at(mean, label, motion)
             self._groups = Groups(label, share, motion, mean * share[:, None, None, None])
@@ -86,20 +87,18 @@ def _bisect(points: Array, groups: int) -> Array:
 
 
 @njit(cache=True)
-def _group_means(matrix: Array, label: Array, share: Array) -> Array:
-    """Means (3 nc, 3 g) of the columns over the groups; of the rows, rather, the matrix being symmetric.
+def _group_sums(matrix: Array, label: Array, groups: int) -> Array:
+    """Sums (3 g, 3 nc) of the rows over the groups, or of the columns, the matrix being symmetric.
 
-    Summed in double precision: rounding here would load the geometric stiffness, and contact would not converge.
+    In double precision: rounding here would load the geometric stiffness, and contact would not converge.
     """
-    sums = np.zeros((3 * len(share), matrix.shape[1]))
+    sums = np.zeros((3 * groups, matrix.shape[1]))
     for n in range(len(label)):
         for axis in range(3):
             total, row = sums[3 * label[n] + axis], matrix[3 * n + axis]
             for c in range(len(row)):
                 total[c] += row[c]
-    for g in range(len(share)):
-        sums[3 * g : 3 * g + 3] *= share[g]
-    return sums.T.astype(matrix.dtype)
+    return sums
 
 
 @njit(cache=True)

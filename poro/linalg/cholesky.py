@@ -178,21 +178,28 @@ def _mirror(matrix: Array) -> None:
 
 
 @njit(cache=True)
+def _copy(row: Array, to: Array) -> None:
+    """to[:] = row, which numba takes four times as long to compile: it prepares a message of what does not fit."""
+    for j in range(len(row)):
+        to[j] = row[j]
+
+
+@njit(cache=True)
 def _reorder(matrix: Array, source: Array) -> None:
     """matrix[source][:, source] in place of a square matrix."""
     row = np.empty_like(matrix[0])
     for i in range(len(matrix)):
-        row[:] = matrix[i]
+        _copy(matrix[i], row)
         for j in range(len(row)):
             matrix[i, j] = row[source[j]]
     moved = np.zeros(len(matrix), np.bool_)
     for first in range(len(matrix)):
         if not moved[first]:
-            row[:] = matrix[first]
+            _copy(matrix[first], row)
             i = first
             while source[i] != first:
-                matrix[i] = matrix[source[i]]
+                _copy(matrix[source[i]], matrix[i])
                 moved[i] = True
                 i = source[i]
-            matrix[i] = row
+            _copy(row, matrix[i])
             moved[i] = True

@@ -286,7 +286,7 @@ def _is_peak(scores, found, reach, least):
     return inside and scores[found[0] + reach, found[1] + reach, found[2] + reach] >= least
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def _searched(block, image, affine, reach, sure, best):
     """The image's cube about where a block is expected, and scores (27,) about the best shift, which best (3,) is set
     to; scores of -1 where there is none.
@@ -326,9 +326,13 @@ def _match_some(fixed, moving, where, reach, sure, best, first, end):
         cube, around = _searched(block, moving, where[1][n], reach, sure, found)
         if around[13] < LEAST_NCC:
             continue
-        best.around[n], best.shift[n] = around, found
+        for m in range(27):
+            best.around[n, m] = around[m]
+        for m in range(3):
+            best.shift[n, m] = found[m]
         middle = cube.hu.shape[0] // 2 - RADIUS
         there = _block(cube, middle + found[0], middle + found[1], middle + found[2], WIDTH)
         near = _block(fixed, start[0] - half, start[1] - half, start[2] - half, 2 * half + 1)
         _scores(there, near, back_reach, found)
-        best.back[n] = found
+        for m in range(3):
+            best.back[n, m] = found[m]
