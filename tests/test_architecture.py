@@ -40,6 +40,7 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         "breathing": {"arrays", "errors", "contact", "fem", "linalg", "mesh"},
     },
     "vatsloc": {
+        "ahead": set(),
         "errors": set(),
         "frames": set(),
         "lazy": set(),
@@ -67,7 +68,7 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         "synthetic": {"errors", "frames", "lazy", "formats", "imaging", "workflow"},
         "study": {
             *("errors", "frames", "lazy", "maps", "terminal", "formats", "imaging", "case", "results", "report"),
-            *("workflow", "evaluation", "synthetic", "breathing"),
+            *("workflow", "evaluation", "synthetic", "breathing", "ahead"),
         },
         "listen_command": {"terminal", "dicomnet", "workflow"},
         "phantom_command": {"errors", "terminal", "synthetic", "study"},
@@ -83,7 +84,7 @@ ROOMS: dict[str, dict[str, set[str]]] = {
                 "synthetic",
                 "study",
             ),
-            *("dicomout", "dicomnet", "navigation", "breathing"),
+            *("dicomout", "dicomnet", "navigation", "breathing", "ahead"),
         },
         "__main__": {"cli"},
     },

@@ -16,6 +16,7 @@ import typer
 # other core, and sums that threads share round otherwise.
 os.environ["OPENBLAS_NUM_THREADS"] = "1"
 
+from vatsloc.ahead import compile_beside
 from vatsloc.errors import GateFailed, as_ours
 from vatsloc.listen_command import listen
 from vatsloc.phantom_command import phantom
@@ -62,6 +63,7 @@ def localize(
     from vatsloc.workflow.run import run_case
     from vatsloc.workflow.settings import load_settings
 
+    compile_beside()
     answered = (lambda answer: show_line({"event": "answer", **answer})) if json_lines else None
     with link(openigtlink) as publish:
         with progress() as tell:
@@ -93,6 +95,7 @@ def prepare(
     from vatsloc.workflow.settings import load_settings
     from vatsloc.workflow.state import prepare_case
 
+    compile_beside()
     told = prepare_case(case, out, load_settings(preset, settings), say)
     if as_json:
         show(told)
@@ -216,6 +219,7 @@ def demo(
     from vatsloc.workflow.run import run_case
     from vatsloc.workflow.settings import load_settings
 
+    compile_beside()
     case, result = out / "case", out / "result"
     write_phantom("demo", case, 0, say)
     run = run_case(case, result, load_settings("fast", None), say)

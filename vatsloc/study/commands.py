@@ -42,6 +42,23 @@ def bench_poro_command(
     _report(result, table, page, out, as_json)
 
 
+@bench.command("cold")
+def bench_cold_command(
+    cases: Annotated[list[Path], typer.Argument(metavar="CASES...", help="Case folders.")],
+    preset: PresetOption = "balanced",
+    out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="List of kernels to write.")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """The first run on a machine: what it compiles, and its seconds with and without a process that compiles beside."""
+    from vatsloc.study.bench.cold import as_json as list_of
+    from vatsloc.study.bench.cold import bench_cold, table
+
+    kernels, result = bench_cold(cases, preset, say)
+    if out is not None:
+        out.write_text(list_of(kernels), encoding="utf-8")
+    _report(result, table, table, None, as_json)
+
+
 @bench.command("registration")
 def bench_registration_command(
     cases: Annotated[
