@@ -1,13 +1,24 @@
-"""Fixtures of the DICOM node's test files."""
+"""Fixtures of vatsloc's test files: most are of the DICOM node's."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from tests.vatsloc import node_scene as scene
+from vatsloc import cli
 from vatsloc.dicomnet.nodule import NoduleFiles
+
+
+@pytest.fixture(scope="session", autouse=True)
+def started() -> Iterator[list[str]]:
+    """Notes instead of the processes that compile kernels beside a command: both processors are at work on tests."""
+    notes: list[str] = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cli, "compile_beside", lambda: notes.append("compile"))
+        yield notes
 
 
 @pytest.fixture(scope="module")

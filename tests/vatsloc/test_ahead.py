@@ -15,6 +15,7 @@ from numba import njit
 
 from vatsloc import ahead
 from vatsloc.ahead import LIST, Kernel, compile_beside, listed
+from vatsloc.cli import main
 from vatsloc.study.bench.cold import as_json, compiled_by
 
 TOY = """
@@ -116,6 +117,14 @@ def test_the_process_ends_with_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
     assert process.poll() is None, "it should still be compiling"
     end(process)
     assert process.poll() is not None
+
+
+@pytest.mark.parametrize("command", ["localize", "prepare"])
+def test_commands_that_run_a_case_start_it(command: str, started: list[str], tmp_path: Path) -> None:
+    started.clear()
+    with pytest.raises(SystemExit):
+        main([command, str(tmp_path / "no case"), "--out", str(tmp_path / "out")])
+    assert started == ["compile"]
 
 
 @njit
