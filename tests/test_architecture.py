@@ -70,7 +70,7 @@ ROOMS: dict[str, dict[str, set[str]]] = {
             *("errors", "frames", "lazy", "maps", "terminal", "formats", "imaging", "case", "results", "report"),
             *("workflow", "evaluation", "synthetic", "breathing", "ahead"),
         },
-        "listen_command": {"terminal", "dicomnet", "workflow"},
+        "listen_command": {"ahead", "terminal", "dicomnet", "workflow"},
         "phantom_command": {"errors", "terminal", "synthetic", "study"},
         "cli": {
             *(

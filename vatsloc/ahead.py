@@ -12,6 +12,7 @@ import json
 import os
 import subprocess
 import sys
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -56,13 +57,14 @@ def listed() -> list[Kernel]:
 
 def compile_beside() -> None:
     """Start to compile in a process of its own, which ends with this one; nothing where the kernel that takes longest
-    is compiled already, or where there is one processor.
+    is compiled already, where there is one processor, or where no process can be started.
     """
     if (os.cpu_count() or 1) < 2 or listed()[0].is_compiled:
         return
     silent = subprocess.DEVNULL
-    process = subprocess.Popen([sys.executable, "-m", __name__], stdin=silent, stdout=silent, stderr=silent)
-    atexit.register(_end, process)
+    with suppress(OSError):
+        process = subprocess.Popen([sys.executable, "-m", __name__], stdin=silent, stdout=silent, stderr=silent)
+        atexit.register(_end, process)
 
 
 def compile_all() -> None:

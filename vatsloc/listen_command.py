@@ -9,6 +9,7 @@ from typing import Annotated
 
 import typer
 
+from vatsloc.ahead import compile_beside
 from vatsloc.terminal import LinkOption, link, say, taking
 
 
@@ -46,6 +47,7 @@ def listen(options: Listening) -> None:
 
     require_pynetdicom()
     load_settings(options.preset, None)
+    compile_beside()  # before the first scan is there
     target = None if options.send is None else target_of(options.send)
     whose = import_series(options.cases, options.ct) if options.ct is not None else ""
     nodules = None if options.nodule is None else NoduleFiles(options.nodule, options.patient or whose)

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from tests.vatsloc import node_scene as scene
-from vatsloc import cli
+from vatsloc import cli, listen_command
 from vatsloc.dicomnet.nodule import NoduleFiles
 
 
@@ -17,7 +17,8 @@ def started() -> Iterator[list[str]]:
     """Notes instead of the processes that compile kernels beside a command: both processors are at work on tests."""
     notes: list[str] = []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(cli, "compile_beside", lambda: notes.append("compile"))
+        for commands in (cli, listen_command):
+            patch.setattr(commands, "compile_beside", lambda: notes.append("compile"))
         yield notes
 
 

@@ -107,6 +107,20 @@ def test_nothing_is_started_where_kernels_lie_on_disk_or_on_one_processor(
     assert len(started) == 1
 
 
+def test_a_run_goes_on_where_no_process_can_be_started(monkeypatch: pytest.MonkeyPatch) -> None:
+    tried: list[object] = []
+
+    def refused(*args: object, **_: object) -> None:
+        tried.append(args)
+        raise OSError("no more processes")
+
+    monkeypatch.setattr(subprocess, "Popen", refused)
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    monkeypatch.setattr(Kernel, "is_compiled", False)
+    compile_beside()
+    assert len(tried) == 1
+
+
 def test_the_process_ends_with_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
     ends: list[tuple[Callable[..., None], subprocess.Popen[bytes]]] = []
     monkeypatch.setattr(ahead.atexit, "register", lambda end, process: ends.append((end, process)))
