@@ -26,7 +26,7 @@ CACHE = "NUMBA_CACHE_DIR"
 
 
 def bench_cold(cases: list[Path], preset: str, say: Say) -> tuple[list[Kernel], dict[str, Any]]:
-    """What runs of all cases compile, the longest first by case; seconds of the first case's run in three ways."""
+    """What runs of all cases compile, the longest first; seconds of the first case's run in three ways."""
     with _empty_cache():
         say("what has to be compiled ...")
         kernels = isolated(_compiled_by_runs, cases, preset)
@@ -79,16 +79,16 @@ class _Listener(event.Listener):
         self.seen: list[tuple[float, Kernel]] = []
         self._depth, self._start = 0, 0.0
 
-    def on_start(self, event: Any) -> None:
+    def on_start(self, _told: Any) -> None:
         self._depth += 1
         if self._depth == 1:
             self._start = time.perf_counter()
 
-    def on_end(self, event: Any) -> None:
+    def on_end(self, told: Any) -> None:
         self._depth -= 1
-        function = event.data["dispatcher"].py_func
+        function = told.data["dispatcher"].py_func
         if self._depth == 0:
-            written = tuple(_written(type_) for type_ in event.data["args"])
+            written = tuple(_written(type_) for type_ in told.data["args"])
             kernel = Kernel(function.__module__, function.__name__, written)
             self.seen.append((time.perf_counter() - self._start, kernel))
 
