@@ -273,6 +273,10 @@ def in_one_piece(
         (replace(FLAT, border=4000), "90 % of 100 points of gas, 2.5 % of its border,"),
         (replace(FLAT, gas_share=0.3), "30 % of 100 points of gas"),
         (replace(FLAT, bare_mm=30.4), "half of a piece would lie over 30 mm from its own keypoints, 30 allowed"),
+        (
+            replace(FLAT, gas_share=0.66),
+            "cost 0.50 of one at keypoints, 66 % of 100 points of gas, 50.0 % of its border, lie along a sheet",
+        ),
     ],
 )
 def test_a_lung_without_fissures_stays_in_one_piece(

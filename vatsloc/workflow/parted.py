@@ -60,7 +60,7 @@ def in_pieces(
         return pose, collapse
     with stages.stage(PIECES):
         fissure = seen_fissure(pose, collapse)
-    if fissure is None or len(fissure.evidence) < 2 or fissure.is_bare:
+    if fissure is None or len(fissure.evidence) < 2 or fissure.is_bare or fissure.is_vague:
         stages.skip(PIECES, _why(fissure))
         return pose, replace(collapse, fissure=fissure)
     with stages.stage(f"{PIECES}, fit"):
@@ -79,7 +79,7 @@ def in_pieces(
 def _why(fissure: Fissure | None) -> str:
     if fissure is None:
         return "too few keypoints to tell pieces apart"
-    if len(fissure.evidence) == 2:
+    if fissure.is_bare:
         return f"half of a piece would lie over {fissure.bare_mm:.0f} mm from its own keypoints, {COVERED_MM:g} allowed"
     cost, share = f"{fissure.cost_share:.2f}", f"{100 * fissure.gas_share:.0f} %"
     gas = f"{fissure.gas} points of gas, {100 * fissure.gas / max(fissure.border, 1):.1f} % of its border,"
