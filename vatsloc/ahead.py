@@ -62,8 +62,11 @@ def compile_beside() -> None:
     if (os.cpu_count() or 1) < 2 or listed()[0].is_compiled:
         return
     silent = subprocess.DEVNULL
+    here = LIST.parents[1]  # another copy of the program in the folder of the command would compile for itself
     with suppress(OSError):
-        process = subprocess.Popen([sys.executable, "-m", __name__], stdin=silent, stdout=silent, stderr=silent)
+        process = subprocess.Popen(
+            [sys.executable, "-m", __name__], stdin=silent, stdout=silent, stderr=silent, cwd=here
+        )
         atexit.register(_end, process)
 
 

@@ -92,8 +92,8 @@ def test_nothing_is_started_where_kernels_lie_on_disk_or_on_one_processor(
     toy: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     kernel = compiled_by(lambda: _call(toy))[0]
-    started: list[object] = []
-    monkeypatch.setattr(subprocess, "Popen", lambda *args, **_: started.append(args))
+    started: list[Path] = []
+    monkeypatch.setattr(subprocess, "Popen", lambda *_, cwd, **__: started.append(cwd))
     monkeypatch.setattr(ahead.atexit, "register", lambda *_: None)
     monkeypatch.setattr(os, "cpu_count", lambda: 2)
     monkeypatch.setattr(ahead, "listed", lambda: [kernel])
@@ -101,7 +101,7 @@ def test_nothing_is_started_where_kernels_lie_on_disk_or_on_one_processor(
     assert not started
     monkeypatch.setattr(Kernel, "is_compiled", False)
     compile_beside()
-    assert len(started) == 1
+    assert started == [Path(ahead.__file__).parents[1]], "this copy of the program, wherever the command was given"
     monkeypatch.setattr(os, "cpu_count", lambda: 1)
     compile_beside()
     assert len(started) == 1
