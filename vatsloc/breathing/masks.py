@@ -164,7 +164,6 @@ def _halves(inside: Array, grid: Grid) -> dict[Side, Array]:
     # Whatever else is left belongs to the lung that it lies nearer to.
     left_over = np.argwhere(inside & ~(right | left))
     to_right, to_left = (distances_to(lung, left_over, grid.spacing) for lung in (right, left))
-    right, left = right.copy(), left.copy()
     for lung, mine in ((right, to_right <= to_left), (left, to_right > to_left)):
         lung[tuple(left_over[mine].T)] = True
     return {"left": left, "right": right}

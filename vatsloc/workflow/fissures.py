@@ -36,7 +36,7 @@ MOST_COST = 0.75
 """Of the cost of one smooth map, what two have to come down to."""
 CLEAR_GAS_SHARE, MOST_COST_BESIDE_IT = 2 / 3, 0.95
 """Where so much of the gas lies along the sheet, keypoints need to say less: most may lie in one lobe. Where less does,
-the lung is not cut: at 0.62 `airless-left` lost by a cut along a sheet that was none (tissue at 0-5 mm 5.7 to 10.4 mm),
+the lung is not cut: at 0.62 `airless-left` lost by a cut along a sheet that was none (tissue at 0-5 mm 7.1 to 10.4 mm),
 which hold-out did not notice; all cuts that gain have 0.71 or more. All were in sight."""
 STARTS = 3
 SLOPES, TILTS, OFFSETS_MM = (0.0, 0.4, 0.7, 0.9, 1.2, 1.6), (-0.4, 0.0, 0.4), np.arange(-48.0, 49.0, 8.0)
