@@ -12,6 +12,7 @@ from functools import partial
 import numpy as np
 from numba import njit
 from scipy import ndimage
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from registration.images.interpolate import interpolate, warp_samples
@@ -211,8 +212,8 @@ NEAR_SPINE_MM = 30.0
 
 def _near_spine(spine: Mask, points: Array) -> Array:
     inside = spine.grid.to_ras(np.argwhere(spine.inside[::4, ::4, ::2]) * [4.0, 4.0, 2.0])
-    squared = np.min(np.sum((points[:, None] - inside[None, :: max(len(inside) // 400, 1)]) ** 2, axis=2), axis=1)
-    return np.asarray(squared <= NEAR_SPINE_MM**2)
+    away, _ = cKDTree(inside[:: max(len(inside) // 400, 1)]).query(points)
+    return np.asarray(away <= NEAR_SPINE_MM)
 
 
 @njit(cache=True, nogil=True)

@@ -50,7 +50,11 @@ class Theta:
 
 @dataclass(frozen=True)
 class PoroSystem:
-    """Everything about one lung that no parameter changes: factor, compliance, wall and load responses."""
+    """Everything about one lung that no parameter changes: factor, compliance, wall and load responses.
+
+    pressure_basis: pressure and what it does at any kappa_b; it and the compliance serve every copy with another
+    motion of the hilum or other modes.
+    """
 
     mesh: TetMesh
     tissue: Tissue
@@ -62,6 +66,7 @@ class PoroSystem:
     wall: ChestWall
     contact_nodes: Array
     compliance: Compliance
+    pressure_basis: PressureBasis
     modes: tuple[LoadMode, ...] = ()
 
     @cached_property
@@ -84,15 +89,10 @@ class PoroSystem:
         imposed = np.stack([mode.imposed for mode in self.modes], axis=2)[self.hilum]
         return self.solid.solve(force, imposed)
 
-    @cached_property
-    def pressure_basis(self) -> PressureBasis:
-        """Pressure and what it does at any kappa_b."""
-        return PressureBasis(self.flow, self.solid, self.pressure_load)
-
-    @cached_property
+    @property
     def pressure_load(self) -> csr_matrix:
         """Sparse (3n, n): nodal forces per kPa of pressure."""
-        return self.tissue.biot * gradient_load(self.mesh)
+        return self.pressure_basis.load
 
 
 def assemble(
@@ -133,7 +133,18 @@ def assemble(
     place[body.free_unknowns] = np.arange(len(body.free_unknowns))
     compliance = Compliance(body.solver, place[unknowns_of(nodes)].reshape(-1, 3), len(body.free_unknowns))
     flow = Flow(mesh, tissue)
-    return PoroSystem(mesh, tissue, gravity, hilum, hilum_displacement, body, flow, wall, nodes, compliance, modes)
+    basis = PressureBasis(flow, body, tissue.biot * gradient_load(mesh))
+    at_hilum = hilum, hilum_displacement
+    return PoroSystem(mesh, tissue, gravity, *at_hilum, body, flow, wall, nodes, compliance, basis, modes)
+
+
+def still_lung(mesh: TetMesh, tissue: Tissue, gravity: Array, hilum: Array) -> PoroSystem:
+    """The lung of `assemble` whose hilum (k,), in ascending order, does not move, with what contact at any parameter
+    needs done and kept.
+    """
+    system = assemble(mesh, tissue, gravity, hilum, np.zeros((len(hilum), 3)))
+    system.compliance.groups(system.wall.rest)
+    return system
 
 
 def without_wall(system: PoroSystem, theta: Theta) -> tuple[Array, Array]:

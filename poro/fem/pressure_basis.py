@@ -34,7 +34,8 @@ class PressureBasis:
     """
 
     def __init__(self, flow: Flow, solid: Solid, load: csr_matrix) -> None:
-        self._flow, self._solid, self._load = flow, solid, load
+        self.load = load
+        self._flow, self._solid = flow, solid
         inner, nodes = len(flow.inner), len(flow.mesh.points)
         self._basis = np.zeros((inner, 0))
         self._conducted, self._stored = self._basis, self._basis
@@ -105,6 +106,6 @@ class PressureBasis:
         if new.shape[1]:
             whole = np.zeros((len(self._response), new.shape[1]))
             whole[self._flow.inner] = -new
-            force = (self._load @ whole).reshape(len(whole), 3, -1)
+            force = (self.load @ whole).reshape(len(whole), 3, -1)
             self._response = np.concatenate([self._response, self._solid.solve(force)], axis=2)
         return self._response

@@ -40,9 +40,11 @@ def signed_distance(inside: Array, ras_from_ijk: Array, step_mm: float, smooth_m
     # Averaging over a step's width first keeps thin structures that point sampling would alias away.
     spacing = np.linalg.norm(ras_from_ijk[:3, :3], axis=0)
     width = np.maximum(np.rint(step_mm / spacing), 1).astype(int)
-    occupied = ndimage.uniform_filter(inside.astype(np.float32), width)
+    first = np.maximum(lower - 2 * width, 0)
+    i, j, k = (slice(a, b) for a, b in zip(first, upper + 2 * width, strict=True))
+    occupied = ndimage.uniform_filter(inside[i, j, k].astype(np.float32), width)
     # An even number of voxels is averaged about a place half a voxel before the one it is stored at.
-    offset = ijk_from_grid[:3, 3] + np.where(width % 2 == 0, 0.5, 0.0)
+    offset = ijk_from_grid[:3, 3] - first + np.where(width % 2 == 0, 0.5, 0.0)
     occupied = ndimage.affine_transform(occupied, ijk_from_grid[:3, :3], offset, tuple(shape), order=1)
     solid = occupied > 0.5
     distance = ndimage.distance_transform_edt(solid) - ndimage.distance_transform_edt(~solid)

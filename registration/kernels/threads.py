@@ -10,9 +10,11 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
+from typing import TypeVar
 
 from numba import get_num_threads
 
+Done = TypeVar("Done")
 PARTS_A_THREAD = 8
 """A thread that is done early takes part of what is left."""
 MANY_POINTS = 30_000
@@ -31,6 +33,18 @@ def in_parts(work: Callable[[int, int], object], n: int, least: int = 1) -> None
         return
     parts = min(n, threads * PARTS_A_THREAD)
     list(_pool(os.getpid(), threads).map(lambda c: work(n * c // parts, n * (c + 1) // parts), range(parts)))
+
+
+def ahead(work: Callable[[], Done]) -> Callable[[], Done]:
+    """Begin on another thread what will probably be asked for; what is returned waits for it, and raises what it raises.
+    With one thread the work is done when it is asked for.
+    """
+    if get_num_threads() == 1:
+        return work
+    other = ThreadPoolExecutor(1, thread_name_prefix="ahead")
+    begun = other.submit(work)
+    other.shutdown(wait=False)
+    return begun.result
 
 
 @cache

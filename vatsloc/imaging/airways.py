@@ -131,18 +131,18 @@ def track_airways(work: Volume, seen: Array, expected: Array, reach_mm: float = 
 
 def _contrasts(hu: Array, lumen_ijk: Array, wall_ijk: Array, steps: Array) -> Array:
     """Mean wall minus mean lumen in HU for every shift (n, 3) in voxels; -inf where half of the tree is lost."""
-    out = np.full(len(steps), -np.inf)
-    for n, step in enumerate(steps):
-        means = []
-        for ijk in (lumen_ijk, wall_ijk):
-            at = ijk + step
-            at = at[((at >= 0) & (at < hu.shape)).all(axis=1)]
-            values = hu[tuple(at.T)]
+    reach = np.abs(steps).max(axis=0)
+    padded = np.pad(np.minimum(hu, 0.0), [(r, r) for r in reach], constant_values=np.nan)
+    shifts = np.ravel_multi_index(tuple((steps + reach).T), padded.shape)
+    flat, means = padded.reshape(-1), np.full((2, len(steps)), np.nan)
+    for mean, ijk in zip(means, (lumen_ijk, wall_ijk), strict=True):
+        places = np.ravel_multi_index(tuple(ijk.T), padded.shape)
+        for n, shift in enumerate(shifts):
+            values = flat[places + shift]
             values = values[np.isfinite(values)]
-            means.append(float(np.minimum(values, 0.0).mean()) if values.size > 0.5 * len(ijk) else np.nan)
-        if np.isfinite(means).all():
-            out[n] = means[1] - means[0]
-    return out
+            if values.size > 0.5 * len(ijk):
+                mean[n] = values.mean()
+    return np.nan_to_num(means[1] - means[0], nan=-np.inf)
 
 
 def _shifted(inside: Array, step: Array) -> Array:

@@ -179,12 +179,14 @@ def estimate_cupping(cbct: Volume, field: FieldOfView) -> tuple[Array, Array]:
 
     The profile is zero where lean tissue reads 40 HU, so that it also carries a constant offset.
     """
-    usable, radius = field.usable.inside, _radius_map(cbct, field)
-    hu = ndimage.uniform_filter(cbct.hu, 3)[usable][::3]
-    r = np.broadcast_to(radius, usable.shape)[usable][::3]
+    taken = np.flatnonzero(field.usable.inside)[::3]
+    hu = ndimage.uniform_filter(cbct.hu, 3).reshape(-1)[taken]
+    r = np.broadcast_to(_radius_map(cbct, field), cbct.hu.shape)[np.unravel_index(taken, cbct.hu.shape)]
     rings = np.linspace(0.0, float(r.max()), 31)
     levels = np.arange(-320.0, 241.0, 8.0)
-    table = ndimage.gaussian_filter(np.histogram2d(r, hu, bins=(rings, levels))[0], (0.7, 0.7))
+    told = (hu >= levels[0]) & (hu <= levels[-1])
+    table = np.histogram2d(r[told], hu[told], bins=(rings, levels))[0]
+    table = ndimage.gaussian_filter(table, (0.7, 0.7))
     weight = table.sum(axis=1)
     shift = np.arange(-180.0, 181.0, 6.0)
     score = _lean_and_fat(table / np.maximum(weight[:, None], 1.0), (levels[:-1] + levels[1:]) / 2, shift)

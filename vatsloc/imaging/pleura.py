@@ -10,6 +10,7 @@ from skimage.segmentation import watershed
 
 from registration.images.filters import gaussian
 from registration.images.morphology import bounding_box, close, dilate, erode
+from registration.images.resample import resample
 from registration.volume import Array, Grid, Mask, Volume
 from vatsloc.imaging.airways import TrackedAirways
 from vatsloc.imaging.cbct import PreparedCbct
@@ -197,8 +198,9 @@ def _local_limit(work: Volume, space: Array, air: Array, limit: float, contrast:
 
 
 def _upsampled(values: Array, source: Grid, target: Grid) -> Array:
-    step = source.ijk_from_ras @ target.ras_from_ijk
-    return ndimage.affine_transform(values, np.diag(step[:3, :3]), step[:3, 3], target.shape, order=1, mode="nearest")
+    around = source.ras_from_ijk.copy()
+    around[:3, 3] = source.to_ras(-np.ones(3))
+    return resample(Volume(np.pad(values, 1, mode="edge"), around), target).hu
 
 
 def _large_pieces(dark: Array, tubes: Array, voxel_ml: float) -> Array:

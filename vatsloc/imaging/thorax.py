@@ -93,20 +93,19 @@ def lung_space(work: Volume, seen: Array, prior: ThoraxPrior) -> tuple[Array, Tr
     airways = track_airways(work, seen, central_airways(prior, work.grid))
     near = dilate(lung, 15.0, spacing) | dilate(other, 10.0, spacing)
     aerated = (work.hu < AERATED_HU) & seen & near & ~dilate(airways.inside, 2.5, spacing)
-    depth = ndimage.distance_transform_edt(aerated, sampling=spacing)
-    return _grow(_owners(depth, lung, other, airways.inside), aerated) == 1, airways
+    return _grow(_owners(aerated, spacing, lung, other, airways.inside), aerated) == 1, airways
 
 
 def _on(mask: Mask, grid: Grid) -> Array:
     return mask.inside if mask.grid.same_as(grid) else on_grid(mask.inside, mask.grid, grid).inside
 
 
-def _owners(depth: Array, lung: Array, other: Array, tubes: Array) -> Array:
+def _owners(aerated: Array, spacing: Array, lung: Array, other: Array, tubes: Array) -> Array:
     """Owner of every core: 1 operated lung, 2 anything else. Cores that belong to both lungs are cut deeper."""
-    owner = np.zeros(depth.shape, dtype=np.uint8)
-    pending = np.ones(depth.shape, dtype=bool)
+    owner = np.zeros(aerated.shape, dtype=np.uint8)
+    pending = np.ones(aerated.shape, dtype=bool)
     for radius in (2.5, 4.0, 6.0, 9.0, 13.0):
-        labels, count = ndimage.label((depth > radius) & pending)
+        labels, count = ndimage.label(erode(aerated, radius, spacing) & pending)
         if count == 0:
             break
         size = np.bincount(labels.ravel(), minlength=count + 1).astype(float)
@@ -123,18 +122,22 @@ def _owners(depth: Array, lung: Array, other: Array, tubes: Array) -> Array:
         if not both.any():
             break
     else:
-        owner = np.where(pending & (owner == 0) & (depth > 0), np.where(lung, 1, 2), owner).astype(np.uint8)
+        owner = np.where(pending & (owner == 0) & aerated, np.where(lung, 1, 2), owner).astype(np.uint8)
     return owner
 
 
 def _grow(owner: Array, allowed: Array) -> Array:
     """Cores grown inside `allowed`, all at one pace, until nothing changes; at most 20 voxels far."""
-    grown = owner
-    cross = ndimage.generate_binary_structure(3, 1)
+    grown, free = owner, allowed & (owner == 0)
     for _ in range(20):
-        front = ndimage.maximum_filter(grown, footprint=cross)
-        new = np.where((grown == 0) & allowed, front, grown)
-        if np.array_equal(new, grown):
+        front = np.zeros_like(grown)
+        for axis in range(3):
+            here, there = np.moveaxis(front, axis, 0), np.moveaxis(grown, axis, 0)
+            np.maximum(here[1:], there[:-1], out=here[1:])
+            np.maximum(here[:-1], there[1:], out=here[:-1])
+        reached = free & (front > 0)
+        if not reached.any():
             break
-        grown = new
+        grown = np.where(reached, front, grown)
+        free &= ~reached
     return grown

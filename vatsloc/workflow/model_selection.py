@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -15,9 +16,9 @@ from poro.collapse import (
     LinearRange,
     PoroStatus,
     PoroSystem,
-    assemble,
     hilum_modes,
     keep_in_range,
+    still_lung,
     uniform_strain_modes,
 )
 from poro.collapse import StrainMeasure as Strain
@@ -27,13 +28,14 @@ from poro.fit import Fit, FitSettings, FitStatus, Target, constraints_to, fit_co
 from poro.fit.elastic_correction import ElasticCorrection, loosened
 from poro.mesh import TetMesh, interpolate, locate
 from registration.correspondences import Correspondences
+from registration.kernels.threads import ahead
 from registration.volume import Array
 from vatsloc.imaging.surface import Border, SurfacePoints
 from vatsloc.workflow.choices import Choice
 from vatsloc.workflow.ensemble import perturbation_ensemble
 from vatsloc.workflow.hold_out import held_out, too_few
 from vatsloc.workflow.keypoints import find_correspondences
-from vatsloc.workflow.observe import Observed
+from vatsloc.workflow.observe import SET_UP, Observed
 from vatsloc.workflow.prepare import Prepared
 from vatsloc.workflow.refinement import unfolded
 from vatsloc.workflow.settings import Settings
@@ -80,6 +82,11 @@ class CollapseModel:
     ensemble: Array
 
     @property
+    def is_refined(self) -> bool:
+        """Whether a refinement was kept."""
+        return any(refinement.kept for refinement in self.refinements)
+
+    @property
     def held_out_mm(self) -> float | None:
         """Median misfit at the held-out keypoints of the training-only model; None where no refinement was tried."""
         if not self.refinements:
@@ -96,14 +103,14 @@ def select_model(
     gravity: Array, prepared: Prepared, observed: Observed, settings: Settings, stages: Stages
 ) -> CollapseModel:
     """Fit the collapse to what was observed, and keep those refinements that predict held-out keypoints better."""
-    tissue, mesh = Tissue(), observed.model_mesh
-    with stages.stage("model set-up"):
-        system = assemble(mesh, tissue, gravity, observed.hilum_nodes, observed.motion.displacement)
+    with stages.stage(SET_UP):
+        still = stages.done(partial(still_lung, observed.model_mesh, Tissue(), gravity, observed.hilum_nodes))
+        system = replace(still, hilum_displacement=observed.motion.displacement)
     surface = surface_target(observed.surface)
     with stages.stage("fit"):
         plain = fit_collapse(system, surface, fit_settings(settings))
         within = LinearRange(share=settings.leave_out.strained_share)
-        solid = keep_in_range(system, plain.state, neo_hookean(tissue), within)
+        solid = keep_in_range(system, plain.state, neo_hookean(system.tissue), within)
     is_finite = solid.strain is Strain.FINITE
     stages.choose(Choice(STRAIN, is_finite, solid.why, solid.share, within.share))
     start = CollapseModel(
@@ -132,7 +139,7 @@ def refined_model(
         return model, model
     if settings.model.regional:
         with stages.stage("regional fit"):
-            steps = {"regional fit": _regional(settings)}
+            steps = {"regional fit": _regional(model.system, settings)}
             model, training_only = select_refinement(steps, model, training_only, surface, or_trial=True)
     if settings.model.correct:
         with stages.stage("elastic correction"):
@@ -140,7 +147,7 @@ def refined_model(
             steps = {
                 f"elastic correction, strain {strain:g}": corrected(strain, fields) for strain in CORRECTION_STRAINS
             }
-            model, training_only = select_refinement(steps, model, training_only, surface)
+            model, training_only = select_refinement(steps, model, training_only, surface, begin=fields.begin)
             if not any(refinement.kept for refinement in model.refinements if refinement.name in steps):
                 steps = {
                     f"elastic correction, strain {strain:g}, held back": held_back(strain, fields)
@@ -156,8 +163,11 @@ def select_refinement(
     training_only: CollapseModel,
     surface: Target,
     or_trial: bool = False,
+    begin: Callable[[CollapseModel, Target], Callable[[], object]] | None = None,
 ) -> tuple[CollapseModel, CollapseModel]:
     """Try each step on the training-only model, which is fitted without the held-out keypoints.
+
+    begin: begins beside the trials what every step does with all keypoints; what it returns waits for that.
 
     The step that predicts these best, if better than without it by GAIN, is done again with all keypoints on the model
     itself; where that does not settle, the next best one is. Where none settles and `or_trial` is set, the best trial
@@ -166,13 +176,17 @@ def select_refinement(
     mesh, found = model.system.mesh, model.correspondences
     hidden = held_out(found.fixed)
     tested, shown = found.only(hidden), _with_keypoints(surface, found.only(~hidden))
+    whole = _with_keypoints(surface, found)
+    begun = begin(model, whole) if begin else None
     trials = {name: step(training_only, shown, training_only.fit) for name, step in steps.items()}
     before = misfit(mesh, training_only.displacement, tested)
     after = {name: misfit(mesh, trial.displacement, tested) for name, trial in trials.items() if _settled(trial)}
     best = None
     better = sorted((name for name, mm in after.items() if mm < GAIN * before), key=lambda name: after[name])
+    if better and begun:
+        begun()
     for name in better:
-        refined = steps[name](model, _with_keypoints(surface, found), trials[name].fit)
+        refined = steps[name](model, whole, trials[name].fit)
         if refined is not model and _settled(refined):
             best, model, training_only = name, refined, trials[name]
             break
@@ -215,14 +229,13 @@ def misfit(mesh: TetMesh, displacement: Array, found: Correspondences) -> float:
     return float(np.median(np.linalg.norm(moved - found.fixed, axis=1)))
 
 
-def _regional(settings: Settings) -> Step:
+def _regional(plain: PoroSystem, settings: Settings) -> Step:
     """Uniform strains of the resting shape, and the hilum's position, as further parameters of the fit."""
+    modes = uniform_strain_modes(plain.mesh, plain.tissue)
+    modes += hilum_modes(plain.mesh, plain.hilum) if settings.model.hilum else ()
+    system = replace(plain, modes=modes)
 
     def step(model: CollapseModel, target: Target, start: Fit) -> CollapseModel:
-        mesh, tissue = model.system.mesh, model.system.tissue
-        modes = uniform_strain_modes(mesh, tissue)
-        modes += hilum_modes(mesh, model.system.hilum) if settings.model.hilum else ()
-        system = replace(model.system, modes=modes)
         theta = start.theta
         chosen = replace(
             fit_settings(settings, len(modes)), starts=((theta.kappa_b, theta.phi, theta.d_diaph_mm, *theta.modes),)
@@ -234,27 +247,38 @@ def _regional(settings: Settings) -> Step:
 
 
 class Corrections:
-    """Elastic corrections of a model towards a target, from the stiffest one on, as far as they are asked for. Those of
-    the pair that was asked for last are kept.
-    """
+    """Elastic corrections of models towards targets, each series from the stiffest one on, as far as it is asked for."""
 
     def __init__(self, settings: FitSettings) -> None:
         self.settings = settings
-        self._of: tuple[CollapseModel, Target] | None = None
-        self._fields: Iterator[ElasticCorrection] = iter(())
-        self._found: list[ElasticCorrection] = []
+        self._series: list[_Series] = []
+
+    def begin(self, model: CollapseModel, target: Target) -> Callable[[], object]:
+        """Begin all that are tried on another thread; what is returned waits for them."""
+        return ahead(partial(self.field, max(CORRECTION_STRAINS), model, target))
 
     def field(self, strain: float, model: CollapseModel, target: Target) -> ElasticCorrection:
         """The one that expects a strain of STIFFEST times a power of two."""
-        if self._of is None or self._of[0] is not model or self._of[1] is not target:
+        series = next((s for s in self._series if s.model is model and s.target is target), None)
+        if series is None:
             mesh, u = model.system.mesh, model.displacement
             wanted = constraints_to(target, mesh, u, self.settings)
-            self._of, self._found = (model, target), []
-            self._fields = loosened(mesh, u, model.system.tissue, wanted, STIFFEST)
+            series = _Series(model, target, loosened(mesh, u, model.system.tissue, wanted, STIFFEST), [])
+            self._series.append(series)
         number = round(np.log2(strain / STIFFEST))
-        while len(self._found) <= number:
-            self._found.append(next(self._fields))
-        return self._found[number]
+        while len(series.found) <= number:
+            series.found.append(next(series.fields))
+        return series.found[number]
+
+
+@dataclass(frozen=True)
+class _Series:
+    """Elastic corrections of a model towards a target. fields: makes them; found: those that were made."""
+
+    model: CollapseModel
+    target: Target
+    fields: Iterator[ElasticCorrection]
+    found: list[ElasticCorrection]
 
 
 def corrected(strain: float, corrections: Corrections) -> Step:

@@ -7,6 +7,8 @@ from functools import partial
 
 import numpy as np
 
+from poro.collapse import still_lung
+from poro.fem import Tissue
 from poro.mesh import TetMesh, TriSurface, stuff
 from registration.images.resample import resample_mask
 from registration.maps.rigid import RigidTransform
@@ -27,7 +29,7 @@ from vatsloc.workflow.prepare import SPINE_INFLATED_TO_DEFLATED, Prepared, Prepa
 from vatsloc.workflow.settings import Settings
 from vatsloc.workflow.stages import DEFLATED, Stages
 
-HILUM = "hilum"
+HILUM, SET_UP = "hilum", "model set-up"
 
 
 @dataclass(frozen=True)
@@ -79,6 +81,7 @@ def observe(
         prior = _prior(prepared, pose, def_from_inf, case.side)
         moved = partial(_motion, prepared, prior, hilum, def_from_inf, model_mesh.points[nodes], settings)
         stages.begin(HILUM, "", moved)
+        stages.begin(SET_UP, "", partial(still_lung, model_mesh, Tissue(), case.gravity_ras, nodes))
         found = find_pneumothorax(prepared.deflated, prior)
         surface = _hinted_surface(case) or deflated_surface(found, prepared.deflated.field)
         if not surface.confidence.any():

@@ -8,6 +8,7 @@ keypoints held out from it better than the lung in one piece does.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from scipy import ndimage
@@ -29,11 +30,10 @@ from vatsloc.workflow.pneumothorax import Collapse, residual_of_part
 from vatsloc.workflow.pose import ChangeOfPose
 from vatsloc.workflow.prepare import Prepared
 from vatsloc.workflow.residual import Residual
-from vatsloc.workflow.seen_fissure import seen_fissure
+from vatsloc.workflow.seen_fissure import PIECES, seen_fissure
 from vatsloc.workflow.settings import Settings
 from vatsloc.workflow.stages import Stages
 
-PIECES = "pieces"
 JOINED_MM = 20.0
 """About the hilum, pieces share their nodes."""
 COARSE_MM = 2.0
@@ -55,11 +55,11 @@ def in_pieces(
     prepared: Prepared, pose: ChangeOfPose, collapse: Collapse, settings: Settings, stages: Stages
 ) -> tuple[ChangeOfPose, Collapse]:
     """The lung in two pieces where it has parted; what was given where it has not."""
-    if not any(refinement.kept for refinement in collapse.model.refinements):
+    if not collapse.model.is_refined:
         stages.skip(PIECES, "no refinement of the model was kept")
         return pose, collapse
     with stages.stage(PIECES):
-        fissure = seen_fissure(pose, collapse)
+        fissure = stages.done(partial(seen_fissure, pose, collapse.observed, collapse.model.correspondences))
     if fissure is None or len(fissure.evidence) < 2 or fissure.is_bare or fissure.is_vague:
         stages.skip(PIECES, _why(fissure))
         return pose, replace(collapse, fissure=fissure)

@@ -23,6 +23,7 @@ from vatsloc.workflow.pose import ChangeOfPose
 from vatsloc.workflow.prepare import Prepared
 from vatsloc.workflow.refinement import BlockRefinement, Compared, Prospect, Shape, prospect, refine_by_blocks
 from vatsloc.workflow.residual import Residual, residual_registration
+from vatsloc.workflow.seen_fissure import PIECES, seen_fissure
 from vatsloc.workflow.settings import Settings
 from vatsloc.workflow.stages import Stages
 
@@ -106,6 +107,8 @@ def collapse(
 ) -> Collapse:
     """The part of `pneumothorax` that follows the observations."""
     model = select_model(case.gravity_ras, prepared, observed, settings, stages)
+    if model.is_refined:
+        stages.begin(PIECES, "", partial(seen_fissure, pose, observed, model.correspondences))
     return modelled(prepared, pose, observed, model, settings, stages)
 
 
@@ -169,7 +172,7 @@ def _residual(
 def residual_of_part(prepared: Prepared, modelled: Collapse, mesh_inf: TetMesh, settings: Settings) -> Residual | None:
     """What the images add to the model of a lung, or of a part of it whose mesh in the inflated CBCT is `mesh_inf`."""
     model, rigid, chosen = modelled.model, modelled.def_from_inf_rigid, settings.residual
-    if any(refinement.kept for refinement in model.refinements):
+    if model.is_refined:
         chosen = chosen.model_copy(update={"levels": max(chosen.levels - 1, 1)})
     return residual_registration(
         prepared,

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -22,6 +23,7 @@ from registration.images.morphology import bounding_box, erode
 from registration.images.resample import coarsen, resample_mask
 from registration.keypoints.aligned_matching import AlignedSettings, Organ, match_aligned, organ_of
 from registration.keypoints.matching import MatchSettings, detect_inside
+from registration.kernels.threads import ahead
 from registration.volume import Array, Mask, Volume
 from vatsloc.imaging.cbct import PreparedCbct
 from vatsloc.imaging.surface import SPACING_MM, SurfacePoints
@@ -134,15 +136,18 @@ def refine_by_blocks(prospect: Prospect, shape: Shape) -> BlockRefinement:
             matches = matches.only(np.abs(shape.cut(matches.moving)) >= BESIDE_CUT_MM)
         if too_few(matches):
             break
-        hidden = held_out(matches.fixed, APART_MM)
+        hidden, whole = held_out(matches.fixed, APART_MM), partial(_followed, trial, matches)
+        if lungs is prospect.lungs[-1]:
+            whole = ahead(whole)
         tested, followed = matches.only(hidden), _followed(trial, matches.only(~hidden))
         before, after = _misfit(trial, tested), _misfit(followed, tested)
         passes.append(Pass(voxel_mm, len(matches), before, after, after < before))
         if after < before:
-            trial, answer = followed, (trial, matches)
+            trial, answer = followed, (whole, matches)
     if answer is None:
         return BlockRefinement(shape.map.moved, tuple(passes))
-    return BlockRefinement(_followed(*answer).map.moved, tuple(passes), answer[1])
+    whole, matches = answer
+    return BlockRefinement(whole().map.moved, tuple(passes), matches)
 
 
 def _around(compared: Compared) -> Compared:

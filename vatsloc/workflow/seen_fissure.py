@@ -8,12 +8,14 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from poro.mesh import closest_points, interpolate, locate
+from registration.correspondences import Correspondences
 from registration.volume import Array
 from vatsloc.imaging.surface import Border
 from vatsloc.workflow.fissures import LEAST_DEEP_MM, Fissure, Sheet, find_fissure, mapped, smooth_map
-from vatsloc.workflow.pneumothorax import Collapse
+from vatsloc.workflow.observe import Observed
 from vatsloc.workflow.pose import ChangeOfPose
 
+PIECES = "pieces"
 GAS_REACH_MM = 20.0
 """How far a keypoint may lie that tells where gas came from."""
 NEIGHBOURS = 4
@@ -27,23 +29,24 @@ ROUNDS = 3
 
 @dataclass(frozen=True)
 class _Seen:
-    """What a sheet is found from. points: (n, 3) RAS mm, keypoints in the CT; hilum: (3,) there; air: (k, 3), the
-    border of gas in the deflated CBCT.
+    """What a sheet is found from. found: keypoints; points: (n, 3) RAS mm, where they lie in the CT; hilum: (3,) there;
+    air: (k, 3), the border of gas in the deflated CBCT.
     """
 
     pose: ChangeOfPose
-    collapse: Collapse
+    observed: Observed
+    found: Correspondences
     points: Array
     hilum: Array
     air: Array
 
     @property
     def moving(self) -> Array:
-        return self.collapse.model.correspondences.moving
+        return self.found.moving
 
     @property
     def fixed(self) -> Array:
-        return self.collapse.model.correspondences.fixed
+        return self.found.fixed
 
     @property
     def motion(self) -> Array:
@@ -51,18 +54,18 @@ class _Seen:
 
     def in_ct(self, points: Array) -> Array:
         """Where points (q, 3) mm of the lung before its collapse lie in the CT."""
-        return _in_ct(self.pose, self.collapse, points)
+        return _in_ct(self.pose, self.observed, points)
 
     def deep(self, in_ct: Array) -> Array:
         """Points (q, 3) mm of the CT that lie deep below the pleura."""
         return in_ct[-closest_points(self.pose.mesh_ct.boundary, in_ct).distance > LEAST_DEEP_MM]
 
 
-def seen_fissure(pose: ChangeOfPose, collapse: Collapse) -> Fissure | None:
+def seen_fissure(pose: ChangeOfPose, observed: Observed, keypoints: Correspondences) -> Fissure | None:
     """The sheet along which keypoints and gas say that the lung parted, with what each of them says; bent to them where
     both say so.
     """
-    seen = _seen(pose, collapse)
+    seen = _seen(pose, observed, keypoints)
     far, near = cKDTree(seen.fixed).query(seen.air, NEIGHBOURS)
     known = far[:, 0] < GAS_REACH_MM
     gas = seen.in_ct(seen.air[known] - seen.motion[near[known]].mean(axis=1))
@@ -73,14 +76,14 @@ def seen_fissure(pose: ChangeOfPose, collapse: Collapse) -> Fissure | None:
     return replace(found, sheet=sheet, bare_mm=_bare_mm(sheet, seen))
 
 
-def _seen(pose: ChangeOfPose, collapse: Collapse) -> _Seen:
-    observed, moving = collapse.observed, collapse.model.correspondences.moving
-    points, hilum = (_in_ct(pose, collapse, x) for x in (moving, observed.hilum.point_ras[None]))
-    return _Seen(pose, collapse, points, hilum[0], observed.surface.only(Border.AIR, Border.FISSURE).points)
+def _seen(pose: ChangeOfPose, observed: Observed, keypoints: Correspondences) -> _Seen:
+    points, hilum = (_in_ct(pose, observed, x) for x in (keypoints.moving, observed.hilum.point_ras[None]))
+    air = observed.surface.only(Border.AIR, Border.FISSURE).points
+    return _Seen(pose, observed, keypoints, points, hilum[0], air)
 
 
-def _in_ct(pose: ChangeOfPose, collapse: Collapse, points: Array) -> Array:
-    return interpolate(locate(collapse.mesh_before, points), pose.mesh_ct.points)
+def _in_ct(pose: ChangeOfPose, observed: Observed, points: Array) -> Array:
+    return interpolate(locate(observed.mesh_before, points), pose.mesh_ct.points)
 
 
 def _bent(sheet: Sheet, seen: _Seen) -> Sheet:
