@@ -1,8 +1,8 @@
 """The collapse of one lung: its loads, its solution at given parameters, and finite strain where that is needed.
 
-`assemble` sets a lung up once (`still_lung` before it is known how the hilum moved), `solve` gives its deflated state at
-parameters `Theta`; `keep_in_range` solves again at finite strain where linear strain leaves its range. Load modes are
-freedom beyond the paper's.
+`assemble` sets a lung up once (`still_lung` before it is known how the hilum moved), `solve` gives its deflated state
+at parameters `Theta`; `keep_in_range` solves again at finite strain where linear strain leaves its range. Load modes
+are freedom beyond the paper's.
 """
 
 from poro.collapse.choice import LinearRange, StrainMeasure, keep_in_range

@@ -36,8 +36,8 @@ def in_parts(work: Callable[[int, int], object], n: int, least: int = 1) -> None
 
 
 def ahead(work: Callable[[], Done]) -> Callable[[], Done]:
-    """Begin on another thread what will probably be asked for; what is returned waits for it, and raises what it raises.
-    With one thread the work is done when it is asked for.
+    """Begin on another thread what will probably be asked for, with one thread nothing; what is returned gives the
+    result, or raises what the work raises.
     """
     if get_num_threads() == 1:
         return work

@@ -124,8 +124,9 @@ def _on_mask(mask: Mask, spacing_mm: float) -> tuple[Array, Array]:
     vertices = vertices[np.sort(first)]
     wide = gaussian(level, 1.5 / spacing)
     rotation = mask.ras_from_ijk[:3, :3] / spacing
-    slope = np.stack([ndimage.map_coordinates(g, vertices.T, order=1) for g in np.gradient(wide, *spacing)], axis=1)
-    normals = -slope @ rotation.T
+    beside = (vertices[:, :, None] + sign * np.eye(3) for sign in (1, -1))
+    after, before = (ndimage.map_coordinates(wide, at.swapaxes(0, 1), order=1, mode="nearest") for at in beside)
+    normals = -((after - before) / (2 * spacing)) @ rotation.T
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
     return mask.grid.to_ras(vertices + start), normals
 

@@ -247,7 +247,7 @@ def _regional(plain: PoroSystem, settings: Settings) -> Step:
 
 
 class Corrections:
-    """Elastic corrections of models towards targets, each series from the stiffest one on, as far as it is asked for."""
+    """Elastic corrections of models towards targets, each series from the stiffest one on, as far as is asked for."""
 
     def __init__(self, settings: FitSettings) -> None:
         self.settings = settings

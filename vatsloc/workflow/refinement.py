@@ -21,9 +21,9 @@ from poro.mesh.tetmesh import signed_volumes
 from registration.correspondences import Correspondences
 from registration.images.morphology import bounding_box, erode
 from registration.images.resample import coarsen, resample_mask
+from registration.kernels.threads import ahead
 from registration.keypoints.aligned_matching import AlignedSettings, Organ, match_aligned, organ_of
 from registration.keypoints.matching import MatchSettings, detect_inside
-from registration.kernels.threads import ahead
 from registration.volume import Array, Mask, Volume
 from vatsloc.imaging.cbct import PreparedCbct
 from vatsloc.imaging.surface import SPACING_MM, SurfacePoints

@@ -18,6 +18,7 @@ from poro.mesh import TetMesh
 from registration.correspondences import Correspondences
 from registration.ffd import FfdSettings, Weights, register_ffd
 from registration.images.morphology import dilate, erode
+from registration.kernels.threads import ahead
 from registration.maps.inversion import invert_at
 from registration.volume import Array, Mask
 from vatsloc.imaging.surface import Border, SurfacePoints
@@ -88,8 +89,9 @@ def residual_registration(
     expected_at = keypoints.mapped(moving=def_from_inf)
     forth, homeward = (expected_at, expected_at.swapped()) if len(keypoints) else (None, None)
     register = partial(register_ffd, settings=ffd, moving_mask=scans.both_see)
+    returning = ahead(partial(register, scans.warped, scans.deflated, fixed_mask=expected, matches=homeward))
     there = register(scans.deflated, scans.warped, fixed_mask=observed, matches=forth)
-    back = register(scans.warped, scans.deflated, fixed_mask=expected, matches=homeward)
+    back = returning()
     inverse = invert_at(there.moving_from_fixed, nodes, nodes)
     placed, other = inverse.points_fixed, back.moving_from_fixed(nodes)
     disagreement = np.linalg.norm(placed - other, axis=1)
