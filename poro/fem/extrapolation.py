@@ -14,7 +14,7 @@ from scipy.sparse import coo_matrix
 from poro.arrays import Array
 from poro.fem.constraints import point_constraints
 from poro.fem.forms import deformation_gradient
-from poro.fem.solid import constrained, solid
+from poro.fem.solid import constrained, continued
 from poro.fem.tissue import Tissue
 from poro.mesh.tetmesh import TetMesh
 
@@ -82,10 +82,9 @@ def extrapolate(
 
 
 def _continue(mesh: TetMesh, nodes: Array, displacement: Array, tissue: Tissue, weights: Array | None) -> Array:
-    still = np.zeros_like(mesh.points)
     if weights is None:
         order = np.argsort(nodes)
-        return solid(mesh, tissue, nodes).solve(still, displacement[order])
+        return continued(mesh, tissue, nodes[order], displacement[order])
     # A weight of 1 makes the constraint as stiff as the tissue that one node stands for.
     stiffness = weights * tissue.young_kpa * np.cbrt(mesh.node_volumes[nodes])
     k = len(nodes)

@@ -9,6 +9,7 @@ from typing import Any, Protocol
 
 import numpy as np
 import pyamg
+from pyamg.util.utils import get_block_diag
 from scipy.sparse import bsr_matrix, csr_matrix
 from scipy.sparse.linalg import LinearOperator, cg
 
@@ -16,6 +17,7 @@ from poro.arrays import Array
 from poro.errors import SolverError
 from poro.linalg.cholesky import Cholesky, cholesky
 from poro.linalg.dissection import Tree, dissect
+from poro.linalg.relaxation import BLOCK, backward, forward_from_zero
 
 # Numbers in a factor above which memory (8 bytes each) decides for the iterative solver.
 FACTOR_LIMIT = 150_000_000
@@ -38,11 +40,13 @@ class Multigrid:
     """Conjugate gradients preconditioned by one V-cycle of smoothed aggregation; stops at a relative residual of
     `tolerance`.
 
+    inverses: (n, 3, 3) of the diagonal's blocks where the matrix has three unknowns a node, None where it has one;
     residuals: norms of the last right-hand side's iterations, the first before any.
     """
 
     matrix: bsr_matrix
     hierarchy: Any
+    inverses: Array | None
     tolerance: float = 1e-10
     residuals: list[float] = field(default_factory=list)
 
@@ -72,15 +76,25 @@ class Multigrid:
         *levels, coarsest = self.hierarchy.levels
         rights, guesses = [right], []
         for level in levels:
-            guess = np.zeros_like(rights[-1])
-            level.presmoother(level.A, guess, rights[-1])
+            guess, left = self._smoothed(level, rights[-1])
             guesses.append(guess)
-            rights.append(level.R @ (rights[-1] - level.A @ guess))
+            rights.append(level.R @ left)
         x = self.hierarchy.coarse_solver(coarsest.A, rights.pop())
         for level, guess, b in zip(reversed(levels), reversed(guesses), reversed(rights), strict=True):
             x = guess + level.P @ x
-            level.postsmoother(level.A, x, b)
+            if self.inverses is not None and level is levels[0]:
+                backward(level.A, self.inverses, b, x)
+            else:
+                level.postsmoother(level.A, x, b)
         return np.asarray(x)
+
+    def _smoothed(self, level: Any, right: Array) -> tuple[Array, Array]:
+        """A sweep from zero on a level, and the residual that it leaves."""
+        if self.inverses is not None and level is self.hierarchy.levels[0]:
+            return forward_from_zero(level.A, self.inverses, right)
+        guess = np.zeros_like(right)
+        level.presmoother(level.A, guess, right)
+        return guess, right - level.A @ guess
 
 
 @dataclass(frozen=True)
@@ -152,8 +166,11 @@ def multigrid(matrix: csr_matrix, points: Array, tolerance: float = 1e-10) -> Mu
         presmoother=("block_gauss_seidel", {"sweep": "forward"}),
         postsmoother=("block_gauss_seidel", {"sweep": "backward"}),  # the other way, or the cycle is not symmetric
         max_coarse=300,
+        coarse_solver="splu",  # PyAMG's own choice, a pseudo-inverse, takes longer than all the rest
     )
-    return Multigrid(blocked, hierarchy, tolerance)
+    finest = hierarchy.levels[0].A
+    inverses = get_block_diag(finest, BLOCK, inv_flag=True) if block == BLOCK else None
+    return Multigrid(blocked, hierarchy, inverses, tolerance)
 
 
 def solve_once(matrix: csr_matrix, points: Array, right: Array, tree: Tree | None = None) -> Array:

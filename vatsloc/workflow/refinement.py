@@ -130,16 +130,17 @@ def refine_by_blocks(prospect: Prospect, shape: Shape) -> BlockRefinement:
     for lungs, (voxel_mm, reach_mm) in zip(prospect.lungs, PASSES, strict=True):
         back = trial.map.inverse().linearized
         matches = match_aligned(*lungs, starts, back, AlignedSettings(reach_mm))
-        if np.isfinite(shape.within_mm):
-            matches = matches.only(_depth(shape.map.mesh, matches.moving) <= shape.within_mm)
+        depth = _depth(shape.map.mesh, matches.moving)
+        used = depth <= shape.within_mm
         if shape.cut is not None:
-            matches = matches.only(np.abs(shape.cut(matches.moving)) >= BESIDE_CUT_MM)
+            used &= np.abs(shape.cut(matches.moving)) >= BESIDE_CUT_MM
+        matches, depth = matches.only(used), depth[used]
         if too_few(matches):
             break
-        hidden, whole = held_out(matches.fixed, APART_MM), partial(_followed, trial, matches)
+        hidden, whole = held_out(matches.fixed, APART_MM), partial(_followed, trial, matches, depth)
         if lungs is prospect.lungs[-1]:
             whole = ahead(whole)
-        tested, followed = matches.only(hidden), _followed(trial, matches.only(~hidden))
+        tested, followed = matches.only(hidden), _followed(trial, matches.only(~hidden), depth[~hidden])
         before, after = _misfit(trial, tested), _misfit(followed, tested)
         passes.append(Pass(voxel_mm, len(matches), before, after, after < before))
         if after < before:
@@ -199,12 +200,12 @@ def _depth(mesh: TetMesh, points: Array) -> Array:
     return -closest_points(mesh.boundary, points).distance
 
 
-def _followed(shape: Shape, matches: Correspondences) -> Shape:
-    """The lung after it followed matches, and its wall."""
+def _followed(shape: Shape, matches: Correspondences, depth: Array) -> Shape:
+    """The lung after it followed matches at depth (n,) mm below the pleura, and its wall."""
     anchors, rest, now = shape.anchors, shape.rest, shape.map.moved
     at = MeshMap(shape.map.mesh, rest.points, shape.map.around)(matches.moving)
     offset, k = matches.fixed - shape.map(matches.moving), len(anchors)
-    sigma_mm = np.interp(_depth(shape.map.mesh, matches.moving), (SHALLOW_MM, DEEP_MM), SIGMA_MM)
+    sigma_mm = np.interp(depth, (SHALLOW_MM, DEEP_MM), SIGMA_MM)
     nodes, gap, normals = _off_wall(shape)
     wanted = PointConstraints(
         np.concatenate([at, rest.points[anchors], rest.points[nodes]]),
