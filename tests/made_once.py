@@ -14,6 +14,8 @@ from typing import Any
 import pytest
 
 PRESET = "fast"
+EVERY_PART = {"leave_out": {"residual_mm": -1.0}}
+"""Settings with which the preset leaves out no registration, so that every gate is there."""
 """Of the shared run."""
 
 
@@ -71,15 +73,17 @@ def bare_case(session: pytest.TempPathFactory) -> Path:
 
 
 def demo_run(session: pytest.TempPathFactory) -> Path:
-    """Folder of `result`, what a run of `bare_case` with preset fast wrote, and `opened.json`, what it opened."""
+    """Folder of `result`, what a run of `bare_case` with preset fast and EVERY_PART wrote, and `opened.json`, what that
+    opened.
+    """
     case = bare_case(session)
 
     def make(folder: Path) -> None:
         from vatsloc.workflow.run import run_case
-        from vatsloc.workflow.settings import load_settings
+        from vatsloc.workflow.settings import settings_of
 
         opened = OpenedFiles()
-        run_case(case, folder / "result", load_settings(PRESET, None))
+        run_case(case, folder / "result", settings_of(PRESET, EVERY_PART))
         opened.on = False
         (folder / "opened.json").write_text(json.dumps(sorted(opened.names)), encoding="utf-8")
 

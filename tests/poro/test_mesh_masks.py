@@ -9,7 +9,7 @@ from scipy import ndimage
 
 from poro.arrays import Array
 from poro.mesh import TetMesh, locate, patches, quality, stuff, surface
-from poro.mesh.stuffing import MIN_DIHEDRAL_DEG
+from poro.mesh.stuffing import MIN_DIHEDRAL_DEG, signed_distance
 
 SPACING = np.array([1.5, 1.5, 2.5])
 
@@ -120,3 +120,19 @@ def test_a_mesh_lies_where_its_mask_does_however_many_voxels_are_averaged(edge_m
     mesh = stuff(np.linalg.norm(x - centre, axis=-1) < 40.0, affine, edge_mm)
     middle = np.average(mesh.points, axis=0, weights=mesh.node_volumes)
     assert_allclose(middle, centre, atol=0.3)
+
+
+@pytest.mark.parametrize("width", [np.zeros((3, 2), int), np.array([[9, 30], [17, 4], [23, 11]])])
+def test_what_lies_about_a_mask_does_not_change_its_distances(width: Array) -> None:
+    """Only the mask's box is averaged over."""
+    mask, affine = _lung(1)
+    cut = tuple(slice(w[0] - 3, w[-1] + 4) for w in (np.unique(axis) for axis in np.nonzero(mask)))
+    first = np.array([c.start for c in cut])
+    near = affine.copy()
+    near[:3, 3] += affine[:3, :3] @ first
+    far = near.copy()
+    far[:3, 3] -= affine[:3, :3] @ width[:, 0]
+    alone, there = signed_distance(mask[cut], near, 2.0, 1.6)
+    found, same = signed_distance(np.pad(mask[cut], width), far, 2.0, 1.6)
+    assert_allclose(same, there)
+    assert_allclose(found, alone, atol=1e-9)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.sparse import csr_matrix, identity
 from shapes import box, ellipsoid, order
 from skfem import BilinearForm
@@ -27,6 +27,7 @@ from poro.fem.forms import (
     tangent_stiffness,
     vector_basis,
 )
+from poro.fem.solid import continued
 from poro.fem.tissue import GRAVITY_KPA_PER_MM
 from poro.linalg.cholesky import cholesky
 from poro.linalg.solver import (
@@ -220,6 +221,20 @@ def test_multigrid_leads_to_the_same_answer_and_to_the_same_bits_every_time(monk
     assert not np.array_equal(found, exact)
     np.random.seed(1)  # noqa: NPY002 - the generator that pyamg's own defaults draw from
     assert np.array_equal(found, solve_once(anchored, mesh.points, right))
+
+
+@pytest.mark.parametrize("limit", [0, 10**9])
+def test_imposed_displacements_are_continued_as_by_the_factor(monkeypatch: pytest.MonkeyPatch, limit: int) -> None:
+    mesh, rng = ellipsoid(9.0), np.random.default_rng(4)
+    held = np.sort(rng.choice(len(mesh.points), 60, replace=False))
+    imposed = rng.normal(size=(60, 3))
+    exact = solid(mesh, TISSUE, held).solve(np.zeros_like(mesh.points), imposed)
+    monkeypatch.setattr(poro.linalg.solver, "ONCE_LIMIT", limit)
+    found = continued(mesh, TISSUE, held, imposed)
+    assert_array_equal(found[held], imposed)
+    assert_allclose(found, exact, rtol=0, atol=1e-6)
+    with pytest.raises(ValueError, match="hold three"):
+        continued(mesh, TISSUE, held[:1], imposed[:1])
 
 
 def test_where_single_precision_does_not_suffice_double_answers(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from registration.kernels import threads
-from registration.kernels.threads import in_parts
+from registration.kernels.threads import ahead, in_parts
 
 
 @pytest.fixture
@@ -62,3 +62,34 @@ def test_what_a_part_raises_reaches_the_caller() -> None:
 
     with pytest.raises(ValueError, match="index 500"):
         in_parts(work, 1000)
+
+
+@pytest.mark.usefixtures("two_threads")
+def test_what_will_be_asked_for_is_begun_on_another_thread() -> None:
+    begun, go = threading.Event(), threading.Event()
+
+    def work() -> threading.Thread:
+        begun.set()
+        assert go.wait(10)
+        return threading.current_thread()
+
+    result = ahead(work)
+    assert begun.wait(10)
+    go.set()
+    assert result() is not threading.main_thread()
+
+
+@pytest.mark.usefixtures("two_threads")
+def test_what_work_ahead_raises_is_raised_where_it_is_asked_for() -> None:
+    result = ahead(lambda: [][1])
+    with pytest.raises(IndexError):
+        result()
+
+
+def test_with_one_thread_work_is_done_when_it_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(threads, "get_num_threads", lambda: 1)
+    calls: list[int] = []
+    result = ahead(lambda: calls.append(1))
+    assert calls == []
+    result()
+    assert calls == [1]

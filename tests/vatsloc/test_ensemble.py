@@ -37,7 +37,7 @@ class Tries:
 
 def system() -> PoroSystem:
     other: Any = None
-    return PoroSystem(other, other, GRAVITY, np.array([0, 1]), HILUM, *4 * (other,), other)
+    return PoroSystem(other, other, GRAVITY, np.array([0, 1]), HILUM, *6 * (other,))
 
 
 def surface() -> Target:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from poro.fem import Tissue
 from registration.volume import Array, Mask
 from tests.vatsloc import ball_scene as scene
 from vatsloc.errors import InputRefused
@@ -18,13 +19,14 @@ from vatsloc.imaging.thorax import central_airways
 from vatsloc.workflow import observe as module
 from vatsloc.workflow import prepare
 from vatsloc.workflow.hilum import HilumMotion, HilumSource
-from vatsloc.workflow.observe import Observed, held_nodes, observe
+from vatsloc.workflow.observe import SET_UP, Observed, held_nodes, observe
 from vatsloc.workflow.pose import ChangeOfPose
 from vatsloc.workflow.settings import Settings, settings_of
 from vatsloc.workflow.stages import Stages
 
 HILUM_CT = scene.CENTRE_CT + np.array([-25.0, 6.0, -4.0])
 INF_FROM_DEF = scene.DEF_FROM_INF.inverse()
+GRAVITY = np.array([0.6, 0.0, -0.8])
 COARSE = {"mesh": {"model_edge_mm": 14.0}}
 
 
@@ -52,6 +54,7 @@ class Watched:
             "deflated_surface": self.surface,
             "find_hilum": Hilum(self.hilum_ct, 20.0, True),
             "hilum_motion": HilumMotion(np.zeros((1, 3)), HilumSource.AIRWAYS),
+            "still_lung": "ready",
         }
         for name, answer in answers.items():
             monkeypatch.setattr(prepare if name == "register_spine" else module, name, self._asked(name, answer))
@@ -64,8 +67,13 @@ class Watched:
         return ask
 
     def observe(self, settings: Settings, rigid: Any = None) -> Observed:
-        case: Any = SimpleNamespace(side=self.side, hints=SimpleNamespace(deflated_surface=self.hint))
-        return observe(case, self.prepared, self.pose, settings, self.stages, rigid)
+        hints = SimpleNamespace(deflated_surface=self.hint)
+        case: Any = SimpleNamespace(side=self.side, hints=hints, gravity_ras=GRAVITY)
+        with self.stages.beside():
+            found = observe(case, self.prepared, self.pose, settings, self.stages, rigid)
+            with self.stages.stage(SET_UP):
+                assert self.stages.done(lambda: "begun too late") == "ready"
+        return found
 
 
 @pytest.fixture
@@ -114,6 +122,15 @@ def test_meshes_lie_where_the_pose_and_then_the_spine_put_them(watched: Watched)
     assert_allclose(radius, 1.05 * scene.RADIUS_MM, atol=3.5)
     middle_of_mass = np.average(coarse.points, axis=0, weights=coarse.node_volumes)
     assert_allclose(middle_of_mass, in_def(scene.CENTRE_CT[None])[0], atol=0.3)
+
+
+def test_the_model_is_set_up_beside_the_search_for_the_surface(watched: Watched) -> None:
+    observed = watched.observe(settings_of("balanced", COARSE))
+    mesh, tissue, gravity, hilum, _ = watched.asked["still_lung"]
+    assert mesh is observed.model_mesh
+    assert tissue == Tissue()
+    assert gravity is GRAVITY
+    assert hilum is observed.hilum_nodes
 
 
 def test_the_prior_shows_lung_neighbour_and_airways_where_the_spine_puts_them(watched: Watched) -> None:

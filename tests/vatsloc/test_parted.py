@@ -259,7 +259,7 @@ def in_one_piece(
 ) -> tuple[ChangeOfPose, Collapse, Stages]:
     """What `in_pieces` leaves of the known run, in which such a sheet was seen."""
     scene = known.scene().with_model(refinements=(Refinement("regional fit", 3.0, 2.0, kept),))
-    monkeypatch.setattr(module, "seen_fissure", lambda _pose, _collapse: fissure)
+    monkeypatch.setattr(module, "seen_fissure", lambda *_: fissure)
     stages = Stages()
     return *in_pieces(scene.prepared, scene.pose, scene.collapse, Settings(), stages), stages
 
@@ -320,7 +320,7 @@ def test_pieces_are_registered_each_for_itself_where_a_whole_lung_would_be(
     pose, parted = cut()
     parted = replace(parted, model=replace(parted.model, refinements=(Refinement("two pieces", 3.0, 2.0, True),)))
     marked = replace(parted, points_after=parted.points_after + 1)
-    monkeypatch.setattr(module, "seen_fissure", lambda _pose, _collapse: FLAT)
+    monkeypatch.setattr(module, "seen_fissure", lambda *_: FLAT)
     monkeypatch.setattr(module, "_fitted", lambda *_: (pose, parted))
     monkeypatch.setattr(module, "_with_residual", lambda *_: marked)
     tables = {"residual": {"on": residual}, "leave_out": {"residual_mm": limit_mm}}

@@ -21,14 +21,15 @@ from vatsloc.workflow.pneumothorax import (
     REFINEMENT,
     RESIDUAL,
     Collapse,
+    begin_refinement,
     collapse,
     contact_surface,
-    pneumothorax,
     refined,
 )
 from vatsloc.workflow.pose import ChangeOfPose
 from vatsloc.workflow.refinement import BlockRefinement, Compared, Shape
 from vatsloc.workflow.residual import Residual
+from vatsloc.workflow.seen_fissure import PIECES
 from vatsloc.workflow.settings import RefinementSettings, settings_of
 from vatsloc.workflow.stages import Stages
 
@@ -122,6 +123,21 @@ def test_the_lungs_nodes_go_where_the_models_displacement_and_then_the_images_ta
     assert_array_equal(found.mesh_after.tets, parts.before.tets)
     assert found.residual is images
     assert list(parts.stages.seconds) == [RESIDUAL, REFINEMENT]
+
+
+@pytest.mark.parametrize(("refinements", "begun"), [((), False), ((TRIED,), False), ((TRIED, KEPT), True)])
+def test_a_fissure_is_looked_for_beside_the_images_where_the_model_follows_keypoints(
+    monkeypatch: pytest.MonkeyPatch, refinements: tuple[Refinement, ...], begun: bool
+) -> None:
+    parts = Parts(refinements)
+    monkeypatch.setattr(module, "seen_fissure", lambda *given: given)
+    with parts.stages.beside():
+        parts.run(monkeypatch, None)
+        with parts.stages.stage(PIECES):
+            given = parts.stages.done(lambda: None)
+    assert (given is not None) is begun
+    if given is not None:
+        assert given == (parts.pose, parts.observed, parts.model.correspondences)
 
 
 def test_the_residual_registration_is_asked_in_the_frames_of_the_scans(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -235,15 +251,13 @@ def test_a_collapse_shows_its_parts(monkeypatch: pytest.MonkeyPatch) -> None:
     assert_allclose(found.on_lung(coarse.points)[inner], parts.before.points[inner], atol=1e-6)
 
 
-def test_the_collapse_is_made_of_what_was_observed(monkeypatch: pytest.MonkeyPatch) -> None:
-    words = tuple(object() for _ in range(3))
-    settings, stages = settings_of("balanced"), Stages()
-    monkeypatch.setattr(module, "observe", lambda *values: ("observed", *values))
-    monkeypatch.setattr(module, "collapse", lambda *values: values)
+def test_what_the_images_alone_tell_is_begun_beside_the_model(monkeypatch: pytest.MonkeyPatch) -> None:
+    given: Any = tuple(object() for _ in range(3))
+    stages = Stages()
     monkeypatch.setattr(module, "_prospect", lambda *values: values)
-    observed = ("observed", *words, settings, stages, None)
-    with stages.beside():
-        given: Any = words
-        assert pneumothorax(*given, settings, stages) == (*words, observed, settings, stages)
-        with stages.stage(REFINEMENT):
-            assert stages.done(lambda: None) == (*words[:2], observed, settings)
+    for on in (False, True):
+        settings = settings_of("balanced", {"refinement": {"on": on}})
+        with stages.beside():
+            begin_refinement(*given, settings, stages)
+            with stages.stage(REFINEMENT):
+                assert stages.done(lambda: None) == ((*given, settings) if on else None)

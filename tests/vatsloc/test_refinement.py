@@ -198,7 +198,7 @@ def test_no_element_is_turned_over_by_blocks_that_would_turn_it(pulls: int) -> N
         ),
         np.concatenate([np.repeat(corners, pulls, axis=0), np.repeat(aside, 60, axis=0)]),
     )
-    followed = module._followed(shape, pulled)
+    followed = module._followed(shape, pulled, module._depth(Lung.mesh, pulled.moving))
     assert (signed_volumes(followed.map.moved, Lung.mesh.tets) > 0).all()
     assert (np.linalg.norm(followed.map(aside) - shape.map(aside), axis=1) > 3.0).all()
 

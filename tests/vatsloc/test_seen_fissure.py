@@ -46,8 +46,8 @@ def seen(n: int = 500) -> tuple[_Seen, Array, Array]:
     gas = np.concatenate([collapsed(faces, np.full(160, lower)) for lower in (False, True)])
     surface = SurfacePoints(gas, np.zeros_like(gas), np.ones(len(gas)), np.full(len(gas), Border.AIR))
     told = Correspondences.of(collapsed(points, above(points) < 0), BEFORE_FROM_CT(points))
-    scene = known.scene().with_model(correspondences=told).with_observed(surface=surface, hilum=HILUM)
-    return _seen(scene.pose, scene.collapse), points, faces
+    scene = known.scene().with_observed(surface=surface, hilum=HILUM)
+    return _seen(scene.pose, scene.collapse.observed, told), points, faces
 
 
 def test_keypoints_and_gas_are_read_in_the_ct() -> None:
@@ -62,11 +62,8 @@ def test_a_keypoint_is_of_the_side_that_it_moves_with() -> None:
     clear, side = _sides(PLANE, found)
     assert clear.mean() > 0.9
     assert (side[clear] == np.sign(above(points))[clear]).mean() > 0.99
-    whole = replace(
-        found.collapse,
-        model=replace(found.collapse.model, correspondences=Correspondences.of(found.moving + 4.0, found.moving)),
-    )
-    assert not _sides(PLANE, replace(found, collapse=whole))[0].any()  # both maps are as good
+    whole = Correspondences.of(found.moving + 4.0, found.moving)
+    assert not _sides(PLANE, replace(found, found=whole))[0].any()  # both maps are as good
 
 
 def test_gas_is_carried_back_by_its_own_side() -> None:
@@ -116,7 +113,7 @@ def test_only_what_both_support_is_bent(monkeypatch: pytest.MonkeyPatch, gas_sha
     found, _, _ = seen()
     flat = Fissure(PLANE, 0.5, 100, gas_share, 200)
     monkeypatch.setattr(module, "find_fissure", lambda *_given: flat)
-    fissure = seen_fissure(found.pose, found.collapse)
+    fissure = seen_fissure(found.pose, found.observed, found.found)
     assert fissure is not None
     assert (fissure.sheet.bend is not None) == (gas_share == 0.9)
     assert (fissure.bare_mm > 0) == (gas_share == 0.9)

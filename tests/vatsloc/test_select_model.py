@@ -256,7 +256,7 @@ def test_the_regional_fit_sets_stretches_and_hilum_free_and_starts_where_it_is_t
     monkeypatch.setattr(module, "fit_collapse", fit)
     target = a_surface()
     begin = replace(start.fit, theta=Theta(1e-9, 0.7, 4.0, (0.1, 0.2)))
-    found = _regional(settings_of("balanced", {"model": {"hilum": hilum}}))(start, target, begin)
+    found = _regional(start.system, settings_of("balanced", {"model": {"hilum": hilum}}))(start, target, begin)
     ((system, seen, settings),) = asked
     assert seen is target
     assert len(system.modes) == count

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,7 +12,10 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from poro.collapse import StrainMeasure as Strain
 from poro.collapse.choice import StrainChoice
+from poro.fem import Tissue
+from poro.mesh import TetMesh
 from registration.correspondences import Correspondences
+from registration.volume import Array
 from tests.vatsloc import ball_scene as scene
 from tests.vatsloc.selection_scene import (
     GRAVITY,
@@ -37,6 +40,17 @@ from vatsloc.workflow.settings import settings_of
 from vatsloc.workflow.stages import Stages
 
 
+@dataclass(frozen=True)
+class System:
+    """What model selection reads of the lung that is to collapse."""
+
+    mesh: TetMesh
+    hilum_displacement: Array | None = None
+    gravity: Array = field(default_factory=lambda: GRAVITY)
+    hilum: Array = field(default_factory=lambda: HILUM)
+    tissue: Tissue = field(default_factory=Tissue)
+
+
 class Selection:
     """`select_model` with a plain fit that knows 20 % of the collapse, and corrections that know all of it when shown
     all; whole_fields: False where these have to be held back at some nodes.
@@ -55,10 +69,10 @@ class Selection:
             surface=scene.air_surface(30),
         )
         self.others = np.full((4, *lung.points.shape), 2.0)
-        system = SimpleNamespace(mesh=lung, gravity=GRAVITY, hilum=HILUM)
+        system = System(lung)
         chosen = StrainChoice(self.solid, Strain.FINITE, "because", 0.01, None)
         for name, answer in (
-            ("assemble", system),
+            ("still_lung", system),
             ("fit_collapse", self.plain),
             ("keep_in_range", chosen),
             ("find_correspondences", pairs),
@@ -95,11 +109,11 @@ class Selection:
 def test_the_plain_fit_is_made_of_what_was_observed(monkeypatch: pytest.MonkeyPatch) -> None:
     known = Selection(monkeypatch, pairs_of())
     known.run()
-    lung, _, gravity, hilum, hilum_mm = known.asked["assemble"]
+    lung, _, gravity, hilum = known.asked["still_lung"]
     assert lung is known.observed.model_mesh
     assert_array_equal(gravity, GRAVITY)
     assert_array_equal(hilum, HILUM)
-    assert_array_equal(hilum_mm, HILUM_MM)
+    assert_array_equal(known.asked["fit_collapse"][0].hilum_displacement, HILUM_MM)
     assert_array_equal(known.asked["fit_collapse"][1].points, known.observed.surface.points)
     assert known.asked["fit_collapse"][2] == fit_settings(known.settings)
     assert known.asked["keep_in_range"][1] is known.plain.state
@@ -168,7 +182,7 @@ def test_the_regional_fit_is_tried_unless_it_is_switched_off(
     monkeypatch: pytest.MonkeyPatch, model: dict[str, bool], tried: bool
 ) -> None:
     known = Selection(monkeypatch, pairs_of())
-    monkeypatch.setattr(module, "_regional", lambda _settings: lambda m, t, s: knows(0.9)(m, t, s))
+    monkeypatch.setattr(module, "_regional", lambda _system, _settings: lambda m, t, s: knows(0.9)(m, t, s))
     known.run(model=model)
     assert ("regional fit" in known.stages.seconds) is tried
 

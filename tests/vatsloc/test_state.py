@@ -22,7 +22,7 @@ from vatsloc.workflow.settings import Settings, load_settings, settings_of
 from vatsloc.workflow.state import key_of, prepare_case, read_state, write_state
 
 TIMED = {"seconds", "peak_mb", "peak_mb_by_stage"}
-FAST = load_settings(made_once.PRESET, None)
+FAST = settings_of(made_once.PRESET, made_once.EVERY_PART)
 
 
 @pytest.fixture(scope="module")
@@ -117,7 +117,7 @@ def test_a_state_of_another_scan_is_refused(case: Path, states: tuple[Path, Path
     ("settings", "changed", "sentence"),
     [
         (load_settings("balanced", None), {}, "another preset or other settings"),
-        (settings_of("fast", {"residual": {"grid_mm": 20.0}}), {}, "another preset or other settings"),
+        (load_settings("fast", None), {}, "another preset or other settings"),
         (FAST, {"side": "left"}, "another side"),
     ],
 )
@@ -161,7 +161,7 @@ def test_a_stale_state_is_made_anew(case: Path, states: tuple[Path, Path, list[s
     shutil.copytree(case, bare)
     (bare / "cbct_inflated.nii.gz").unlink()
     shutil.copytree(states[0], old)
-    other = settings_of("fast", {"mesh": {"edge_mm": 12.0}})
+    other = settings_of("fast", {"mesh": {"edge_mm": 12.0}, **made_once.EVERY_PART})
     prepare_case(bare, old, other, said.append)
     assert any("another preset or other settings" in sentence and "done now" in sentence for sentence in said)
     assert "CT lungs ..." in said

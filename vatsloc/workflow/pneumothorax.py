@@ -11,14 +11,13 @@ from poro.collapse import PoroSystem
 from poro.fit import Fit, Identifiability, identifiability
 from poro.mesh import TetMesh, TriSurface, interpolate, locate
 from registration.maps.rigid import RigidTransform
-from registration.spine import RigidFit
 from registration.volume import Array
 from vatsloc.case import Case
 from vatsloc.maps import MeshMap
 from vatsloc.workflow.choices import weigh
 from vatsloc.workflow.fissures import Fissure, Parted
 from vatsloc.workflow.model_selection import CollapseModel, select_model
-from vatsloc.workflow.observe import Observed, observe
+from vatsloc.workflow.observe import Observed
 from vatsloc.workflow.pose import ChangeOfPose
 from vatsloc.workflow.prepare import Prepared
 from vatsloc.workflow.refinement import BlockRefinement, Compared, Prospect, Shape, prospect, refine_by_blocks
@@ -84,28 +83,16 @@ class Collapse:
         return interpolate(locate(self.system.mesh, self.mesh_before.points), nodal)
 
 
-def pneumothorax(
-    case: Case,
-    prepared: Prepared,
-    pose: ChangeOfPose,
-    settings: Settings,
-    stages: Stages,
-    spine: RigidFit | None = None,
-) -> Collapse:
-    """See what there is of the collapsed lung, fit the poroelastic model to it, correct that by the images inside.
-
-    spine: its pose, where it is known.
-    """
-    observed = observe(case, prepared, pose, settings, stages, spine)
+def begin_refinement(case: Case, prepared: Prepared, observed: Observed, settings: Settings, stages: Stages) -> None:
+    """Begin what `refined` needs of the images alone, beside the model."""
     if settings.refinement.on:
         stages.begin(REFINEMENT, "", partial(_prospect, case, prepared, observed, settings))
-    return collapse(case, prepared, pose, observed, settings, stages)
 
 
 def collapse(
     case: Case, prepared: Prepared, pose: ChangeOfPose, observed: Observed, settings: Settings, stages: Stages
 ) -> Collapse:
-    """The part of `pneumothorax` that follows the observations."""
+    """Fit the poroelastic model to what was observed, and correct it by the images inside."""
     model = select_model(case.gravity_ras, prepared, observed, settings, stages)
     if model.is_refined:
         stages.begin(PIECES, "", partial(seen_fissure, pose, observed, model.correspondences))

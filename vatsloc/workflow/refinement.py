@@ -137,7 +137,8 @@ def refine_by_blocks(prospect: Prospect, shape: Shape) -> BlockRefinement:
         matches, depth = matches.only(used), depth[used]
         if too_few(matches):
             break
-        hidden, whole = held_out(matches.fixed, APART_MM), partial(_followed, trial, matches, depth)
+        hidden = held_out(matches.fixed, APART_MM)
+        whole: Callable[[], Shape] = partial(_followed, trial, matches, depth)
         if lungs is prospect.lungs[-1]:
             whole = ahead(whole)
         tested, followed = matches.only(hidden), _followed(trial, matches.only(~hidden), depth[~hidden])

@@ -149,6 +149,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "registration": {"grid_mm": 20.0, "levels": 3, "voxel_mm": 3.0},
         "mesh": {"edge_mm": 10.0, "model_edge_mm": 16.0},
         "refinement": {"cell_mm": 8.0},
+        "leave_out": {"residual_mm": 2.5},
     },
     "balanced": {},
     "accurate": {

@@ -24,7 +24,7 @@ from vatsloc.study.chart.variants import Scored, Variant
 from vatsloc.study.cohort.scored import Tissue, run_maps
 from vatsloc.workflow.observe import observe
 from vatsloc.workflow.parted import in_pieces
-from vatsloc.workflow.pneumothorax import Collapse, modelled, pneumothorax, refined
+from vatsloc.workflow.pneumothorax import Collapse, collapse, modelled, refined
 from vatsloc.workflow.pose import ChangeOfPose, change_of_pose
 from vatsloc.workflow.prepare import Prepared, prepare, prepare_before
 from vatsloc.workflow.settings import load_settings
@@ -103,7 +103,8 @@ def warm_up(folder: Path) -> None:
     """Let everything be compiled that a run needs."""
     case, settings, stages = read_case(folder), load_settings("fast", None), Stages()
     prepared = prepare(case, stages)
-    pneumothorax(case, prepared, change_of_pose(case, prepared, settings, stages), settings, stages)
+    pose = change_of_pose(case, prepared, settings, stages)
+    collapse(case, prepared, pose, observe(case, prepared, pose, settings, stages), settings, stages)
 
 
 @dataclass(frozen=True)
