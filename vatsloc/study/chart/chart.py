@@ -104,7 +104,8 @@ def warm_up(folder: Path) -> None:
     case, settings, stages = read_case(folder), load_settings("fast", None), Stages()
     prepared = prepare(case, stages)
     pose = change_of_pose(case, prepared, settings, stages)
-    collapse(case, prepared, pose, observe(case, prepared, pose, settings, stages), settings, stages)
+    observed = observe(case, prepared, pose, settings, stages)
+    refined(case, prepared, pose, collapse(case, prepared, pose, observed, settings, stages), settings, stages)
 
 
 @dataclass(frozen=True)
