@@ -15,6 +15,7 @@ from registration.volume import Array
 from vatsloc.case import Case
 from vatsloc.maps import MeshMap
 from vatsloc.workflow.choices import weigh
+from vatsloc.workflow.evened import evened
 from vatsloc.workflow.fissures import Fissure, Parted
 from vatsloc.workflow.model_selection import CollapseModel, select_model
 from vatsloc.workflow.observe import Observed
@@ -112,7 +113,7 @@ def modelled(
 def refined(
     case: Case, prepared: Prepared, pose: ChangeOfPose, collapse: Collapse, settings: Settings, stages: Stages
 ) -> Collapse:
-    """The collapse, in one piece or in several, after it followed small blocks of the CT."""
+    """The collapse, in one piece or in several, after it followed small blocks of the CT; evened near the pleura."""
     if not settings.refinement.on:
         stages.skip(REFINEMENT, "switched off in the settings")
         return collapse
@@ -126,7 +127,10 @@ def refined(
         )
         known = stages.done(partial(_prospect, case, prepared, collapse.observed, settings))
         refinement = refine_by_blocks(known, shape)
-    return replace(collapse, points_after=refinement.points, refinement=refinement)
+        parted = collapse.parted
+        piece = np.zeros(len(refinement.points), dtype=int) if parted is None else parted.pieces.node_piece()
+        after = evened(pose.mesh_ct, refinement.points, piece)
+    return replace(collapse, points_after=after, refinement=refinement)
 
 
 def _prospect(case: Case, prepared: Prepared, observed: Observed, settings: Settings) -> Prospect:
