@@ -69,7 +69,8 @@ def solid(mesh: TetMesh, tissue: Tissue, fixed: Array, constraints: csr_matrix |
 def continued(mesh: TetMesh, tissue: Tissue, fixed: Array, imposed: Array) -> Array:
     """Displacements (n, 3) mm of a body of which nodes `fixed` (k,), in ascending order, are moved by (k, 3) mm.
 
-    As of `solid` and its `solve`, in half the time where that is asked for once. Raises as `solid`.
+    As of `solid` and its `solve`, for less where that is asked for once, to the tolerance of `solve_once`. Raises as
+    `solid`.
     """
     _require_held(mesh, fixed)
     free, matrix, coupling = _parted(stiffness(mesh, tissue.lame_kpa, tissue.shear_kpa), fixed)
