@@ -72,8 +72,7 @@ class Parts:
         self.model = CollapseModel(system, nothing, moved, self.pairs, tuple(refinements), nothing, np.zeros((0, 0, 3)))
         self.asked: list[tuple[Any, ...]] = []
         self.refined: list[tuple[Compared, Shape]] = []
-        self.off, self.even = np.zeros(3), np.zeros(3)
-        self.evened: list[tuple[Any, ...]] = []
+        self.off = np.zeros(3)
 
     def run(self, monkeypatch: pytest.MonkeyPatch, images: Residual | None, **tables: Any) -> Collapse:
         case: Any = SimpleNamespace(gravity_ras=np.array([1.0, 0, 0]), ct=scene.ct())
@@ -97,11 +96,6 @@ class Parts:
             self.refined.append((compared, shape))
             return BlockRefinement(shape.map.moved + self.off, ())
 
-        def even(*given: Any) -> Array:
-            self.evened.append(given)
-            return np.asarray(given[1] + self.even)
-
-        monkeypatch.setattr(module, "evened", even)
         monkeypatch.setattr(module, "prospect", ready)
         monkeypatch.setattr(module, "refine_by_blocks", refine)
         monkeypatch.setattr(module, "select_model", select_model)
@@ -208,7 +202,7 @@ def test_a_model_that_predicts_unseen_places_makes_the_images_superfluous(
 
 def test_blocks_of_the_ct_refine_what_model_and_images_made(monkeypatch: pytest.MonkeyPatch) -> None:
     parts = Parts()
-    parts.off, parts.even = np.array([1.0, -2.0, 0.5]), np.array([0.0, 0.25, 0.0])
+    parts.off = np.array([1.0, -2.0, 0.5])
     images = correction(parts)
     found = parts.run(monkeypatch, images)
     ((compared, shape),) = parts.refined
@@ -219,14 +213,11 @@ def test_blocks_of_the_ct_refine_what_model_and_images_made(monkeypatch: pytest.
     assert shape.rest is parts.before
     assert shape.map.mesh is parts.pose.mesh_ct
     assert_allclose(shape.map.around.matrix, (scene.DEF_FROM_INF @ scene.INF_FROM_CT).matrix, atol=1e-12)
-    assert (len(shape.anchors), shape.within_mm, shape.cut) == (0, np.inf, None)
+    assert (len(shape.anchors), shape.within_mm, shape.cut, shape.piece) == (0, np.inf, None, None)
     inner = scene.inner_nodes(parts.before, scene.CENTRE_DEF, 35.0)
     truth = scene.collapsed(parts.before.points)
     assert_allclose((shape.map.moved - images.displacement)[inner], truth[inner], atol=1e-6)
-    assert_array_equal(found.points_after, shape.map.moved + parts.off + parts.even)
-    ((mesh, _, piece),) = parts.evened
-    assert mesh is parts.pose.mesh_ct
-    assert not piece.any()
+    assert_array_equal(found.points_after, shape.map.moved + parts.off)
     assert found.refinement is not None
 
 
@@ -235,14 +226,14 @@ def test_blocks_of_a_cut_lung_know_the_cut(monkeypatch: pytest.MonkeyPatch) -> N
     found = parts.run(monkeypatch, None)
     cut: Any = SimpleNamespace(
         fissure=SimpleNamespace(sheet=SimpleNamespace(distance=lambda points: points[:, 2])),
-        pieces=SimpleNamespace(node_piece=lambda: "pieces"),
+        pieces=SimpleNamespace(node_piece=lambda: np.array([0, 1])),
     )
     case: Any = SimpleNamespace(ct=scene.ct())
     refined(case, parts.prepared, parts.pose, replace(found, parted=cut), settings_of("balanced", {}), parts.stages)
-    told = parts.refined[-1][1].cut
-    assert told is not None
-    assert_array_equal(told(np.array([[1.0, 2.0, 3.0]])), [3.0])
-    assert parts.evened[-1][2] == "pieces"
+    shape = parts.refined[-1][1]
+    assert shape.cut is not None
+    assert_array_equal(shape.cut(np.array([[1.0, 2.0, 3.0]])), [3.0])
+    assert_array_equal(shape.piece, [0, 1])
 
 
 def test_a_refinement_that_is_switched_off_is_not_asked(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,8 +16,10 @@ from tests.vatsloc import ball_scene as scene
 from vatsloc.imaging.surface import Border, SurfacePoints
 from vatsloc.maps import MeshMap
 from vatsloc.workflow import refinement as module
+from vatsloc.workflow.hold_out import held_out
 from vatsloc.workflow.refinement import Compared, Shape, prospect, refine_by_blocks
 from vatsloc.workflow.settings import RefinementSettings
+from vatsloc.workflow.smoothed import Smoother
 
 AROUND = scene.DEF_FROM_INF @ scene.INF_FROM_CT
 ON = RefinementSettings()
@@ -55,11 +57,14 @@ def test_the_lung_follows_blocks_up_to_the_pleura() -> None:
     assert before[shallow].mean() > 1.8
     assert after[shallow].mean() < 0.65 * before[shallow].mean()
     assert after[~shallow].mean() < 0.45
-    assert [one.voxel_mm for one in found.passes] == [1.5, 1.0]
+    assert [one.voxel_mm for one in found.passes] == [1.5, 1.5, 1.0]
     first = found.passes[0]
     assert first.kept
     assert first.after_mm < first.before_mm
     assert (signed_volumes(found.points, Lung.mesh.tets) > 0).all()
+
+
+unsmoothed = Smoother(())
 
 
 def wall_of(points: Array, normals: Array) -> SurfacePoints:
@@ -154,20 +159,33 @@ def test_of_the_scan_s_points_those_are_followed_that_lie_near_the_pleura_before
     assert_array_equal(taken[clear], depth[clear] < limit)
 
 
-def test_a_lung_that_is_right_is_left_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Blocks that scatter about the truth predict those held out no better than the truth does."""
+def test_blocks_that_those_held_out_contradict_are_not_followed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Blocks say 2 mm to the one side, those held out 2 mm to the other."""
     rng = np.random.default_rng(0)
 
-    def scattered(*_asked: Any) -> Correspondences:
-        ct = scene.CENTRE_CT + rng.uniform(-22, 22, (400, 3))
-        return Correspondences.of(shape.map(ct) + rng.normal(size=(400, 3)), ct)
+    def torn(*_asked: Any) -> Correspondences:
+        now = shape.map(scene.CENTRE_CT + rng.uniform(-22, 22, (400, 3)))
+        aside = np.where(held_out(now, module.APART_MM)[:, None], [-2.0, 0, 0], [2.0, 0, 0])
+        return Correspondences.of(now, shape.map.inverse()(now - aside))
 
-    monkeypatch.setattr(module, "match_aligned", scattered)
+    monkeypatch.setattr(module, "match_aligned", torn)
     shape = Shape(Lung.rest, MeshMap(Lung.mesh, Lung.truth, AROUND), np.zeros(0, int))
     found = refine_by_blocks(prospect(compared(), Lung.rest, ON), shape)
-    assert [one.kept for one in found.passes] == [False, False]
-    assert all(one.blocks == 400 and one.after_mm >= one.before_mm for one in found.passes)
+    assert [one.kept for one in found.passes] == [False, False, False]
+    assert all(one.blocks == 400 and one.after_mm > 1.2 * one.before_mm for one in found.passes)
     assert_array_equal(found.points, Lung.truth)
+
+
+@pytest.mark.parametrize(("worse", "kept"), [(1.01, True), (1.03, False)])
+def test_a_pass_is_followed_that_leaves_hardly_more_at_held_out_blocks(
+    worse: float, kept: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They judge a lung that followed only the others."""
+    misfits = iter([1.0, worse] * 3)
+    monkeypatch.setattr(module, "_misfit", lambda *_given: next(misfits))
+    found = refine_by_blocks(prospect(compared(), Lung.rest, ON), Lung.shape(np.zeros(0, int)))
+    assert [one.kept for one in found.passes] == [kept] * 3
+    assert (found.points == Lung.start).all() != kept
 
 
 @pytest.mark.parametrize("lost", ["lung", "lung_ct"])
@@ -198,7 +216,7 @@ def test_no_element_is_turned_over_by_blocks_that_would_turn_it(pulls: int) -> N
         ),
         np.concatenate([np.repeat(corners, pulls, axis=0), np.repeat(aside, 60, axis=0)]),
     )
-    followed = module._followed(shape, pulled, module._depth(Lung.mesh, pulled.moving))
+    followed = module._followed(shape, pulled, module._depth(Lung.mesh, pulled.moving), unsmoothed)
     assert (signed_volumes(followed.map.moved, Lung.mesh.tets) > 0).all()
     assert (np.linalg.norm(followed.map(aside) - shape.map(aside), axis=1) > 3.0).all()
 

@@ -15,7 +15,6 @@ from registration.volume import Array
 from vatsloc.case import Case
 from vatsloc.maps import MeshMap
 from vatsloc.workflow.choices import weigh
-from vatsloc.workflow.evened import evened
 from vatsloc.workflow.fissures import Fissure, Parted
 from vatsloc.workflow.model_selection import CollapseModel, select_model
 from vatsloc.workflow.observe import Observed
@@ -113,24 +112,22 @@ def modelled(
 def refined(
     case: Case, prepared: Prepared, pose: ChangeOfPose, collapse: Collapse, settings: Settings, stages: Stages
 ) -> Collapse:
-    """The collapse, in one piece or in several, after it followed small blocks of the CT; evened near the pleura."""
+    """The collapse, in one piece or in several, after it followed small blocks of the CT."""
     if not settings.refinement.on:
         stages.skip(REFINEMENT, "switched off in the settings")
         return collapse
     with stages.stage(REFINEMENT):
-        around = collapse.def_from_inf_rigid @ pose.inf_from_ct_rigid
+        around, parted = collapse.def_from_inf_rigid @ pose.inf_from_ct_rigid, collapse.parted
         shape = Shape(
             collapse.mesh_before,
             MeshMap(pose.mesh_ct, collapse.points_after, around),
             np.zeros(0, dtype=int),
-            cut=None if collapse.parted is None else collapse.parted.fissure.sheet.distance,
+            cut=None if parted is None else parted.fissure.sheet.distance,
+            piece=None if parted is None else parted.pieces.node_piece(),
         )
         known = stages.done(partial(_prospect, case, prepared, collapse.observed, settings))
         refinement = refine_by_blocks(known, shape)
-        parted = collapse.parted
-        piece = np.zeros(len(refinement.points), dtype=int) if parted is None else parted.pieces.node_piece()
-        after = evened(pose.mesh_ct, refinement.points, piece)
-    return replace(collapse, points_after=after, refinement=refinement)
+    return replace(collapse, points_after=refinement.points, refinement=refinement)
 
 
 def _prospect(case: Case, prepared: Prepared, observed: Observed, settings: Settings) -> Prospect:

@@ -2,7 +2,8 @@
 the lung, right up to the pleura, and followed elastically.
 
 Vessels reach within a few millimetres of the pleura, but only blocks of 7 to 11 mm that are cut off at the pleura see
-them, and such blocks are found only where a map is right to a few millimetres. So this comes last in each phase.
+them, and such blocks are found only where a map is right to a few millimetres. So this comes last in each phase. Blocks
+scatter, and elasticity carries their scatter on, while true motion is smooth: it is smoothed after each pass.
 """
 
 from __future__ import annotations
@@ -30,16 +31,20 @@ from vatsloc.imaging.surface import SPACING_MM, SurfacePoints
 from vatsloc.maps import MeshMap
 from vatsloc.workflow.hold_out import held_out, too_few
 from vatsloc.workflow.settings import RefinementSettings
+from vatsloc.workflow.smoothed import Smoother, smoother
 
-PASSES = ((1.5, 6.0), (1.0, 3.0))
-"""Voxels of the blocks and how far they are looked for, mm, pass by pass."""
+PASSES = ((1.5, 6.0), (1.5, 6.0), (1.0, 3.0))
+"""Voxels of the blocks and how far they are looked for, mm, pass by pass: more are found where the first ones led."""
+NO_WORSE = 1.02
+"""A pass is followed that leaves at most this much more of the misfit at held-out blocks. They judge a lung that
+followed only three quarters of what the answer follows."""
 MARGIN_MM = 16.0
 """What is kept of a scan about the lung: more than a block and its search reach."""
 RIM_MM = 2.0
 """What is cut off the lung in both images: nearer than this to its border, voxels also show what lies beyond."""
-SIGMA_MM, STRAIN = (1.0, 2.0), 0.01
+SIGMA_MM, STRAIN = (1.0, 2.0), 0.02
 """Standard deviation of a block's position, near the pleura and deep below it, and how far tissue gives way to it
-(`elastic_correction`). Deep in the lung what came before is as sure as a block."""
+(`elastic_correction`) before it is smoothed. Deep in the lung what came before is as sure as a block."""
 SHALLOW_MM, DEEP_MM = 8.0, 20.0
 """Where the one ends and the other begins."""
 WALL_SIGMA_MM, WALL_REACH_MM, WALL_ALONG = 2.0, 5.0, 0.7
@@ -80,7 +85,7 @@ class Shape:
     """A lung in a scan. rest: undeformed, in the scan's frame; map: from the CT, with the same tetrahedra; anchors:
     (k,) nodes that other evidence has placed; within_mm: how deep below the pleura blocks are followed; wall: what its
     surface touches in the scan, None where it need not touch anything; cut: distance (n,) mm of points (n, 3) of the CT
-    from a cut through the lung, None where there is none.
+    from a cut through the lung, None where there is none; piece: (n,) of every node, None for one piece.
     """
 
     rest: TetMesh
@@ -89,6 +94,7 @@ class Shape:
     within_mm: float = float("inf")
     wall: SurfacePoints | None = None
     cut: Callable[[Array], Array] | None = None
+    piece: Array | None = None
 
     def moved(self, points: Array) -> Shape:
         """The same lung with its nodes at points (n, 3) mm of the scan."""
@@ -120,11 +126,13 @@ class BlockRefinement:
 
 
 def refine_by_blocks(prospect: Prospect, shape: Shape) -> BlockRefinement:
-    """Nodes of a lung moved to where small blocks of the CT are found in a scan; as they were where none judge well.
+    """Nodes of a lung moved to where small blocks of the CT are found in a scan, smoothed; as they were where held-out
+    blocks judge badly.
 
     Until the last pass held-out blocks are not followed, then all are, from what the passes before left.
     """
     starts = _within_reach(prospect.points, shape)
+    smooth = ahead(partial(_smoother, shape))
     passes: list[Pass] = []
     trial, answer = shape, None
     for lungs, (voxel_mm, reach_mm) in zip(prospect.lungs, PASSES, strict=True):
@@ -138,18 +146,25 @@ def refine_by_blocks(prospect: Prospect, shape: Shape) -> BlockRefinement:
         if too_few(matches):
             break
         hidden = held_out(matches.fixed, APART_MM)
-        whole: Callable[[], Shape] = partial(_followed, trial, matches, depth)
-        if lungs is prospect.lungs[-1]:
+        whole: Callable[[], Shape] = partial(_followed, trial, matches, depth, smooth())
+        if len(passes) == len(PASSES) - 1:
             whole = ahead(whole)
-        tested, followed = matches.only(hidden), _followed(trial, matches.only(~hidden), depth[~hidden])
+        tested, followed = matches.only(hidden), _followed(trial, matches.only(~hidden), depth[~hidden], smooth())
         before, after = _misfit(trial, tested), _misfit(followed, tested)
-        passes.append(Pass(voxel_mm, len(matches), before, after, after < before))
-        if after < before:
+        passes.append(Pass(voxel_mm, len(matches), before, after, after < NO_WORSE * before))
+        if passes[-1].kept:
             trial, answer = followed, (whole, matches)
     if answer is None:
         return BlockRefinement(shape.map.moved, tuple(passes))
     whole, matches = answer
     return BlockRefinement(whole().map.moved, tuple(passes), matches)
+
+
+def _smoother(shape: Shape) -> Smoother:
+    """Of the lung before it moved."""
+    mesh = shape.map.mesh
+    piece = np.zeros(len(mesh.points), dtype=int) if shape.piece is None else shape.piece
+    return smoother(mesh, piece, shape.anchors)
 
 
 def _around(compared: Compared) -> Compared:
@@ -176,12 +191,16 @@ def prospect(compared: Compared, rest: TetMesh, settings: RefinementSettings) ->
     """
     prepare_solid(rest, Tissue())
     around = _around(compared)
-    lungs = [(coarsen(around.scan.volume, voxel_mm), coarsen(around.ct, voxel_mm)) for voxel_mm, _ in PASSES]
-    organs = tuple(
-        (organ_of(scan, resample_mask(around.lung, scan.grid)), organ_of(ct, resample_mask(around.lung_ct, ct.grid)))
-        for scan, ct in lungs
-    )
-    image, inside = lungs[0][0], organs[0][0].image.inside
+    lungs = {mm: (coarsen(around.scan.volume, mm), coarsen(around.ct, mm)) for mm, _ in PASSES}
+    made = {
+        mm: (
+            organ_of(scan, resample_mask(around.lung, scan.grid)),
+            organ_of(ct, resample_mask(around.lung_ct, ct.grid)),
+        )
+        for mm, (scan, ct) in lungs.items()
+    }
+    organs = tuple(made[mm] for mm, _ in PASSES)
+    image, inside = lungs[PASSES[0][0]][0], organs[0][0].image.inside
     if not inside.any():
         return Prospect(np.zeros((0, 3)), organs)
     match = MatchSettings(voxel_mm=PASSES[0][0], cell_mm=settings.cell_mm)
@@ -201,21 +220,46 @@ def _depth(mesh: TetMesh, points: Array) -> Array:
     return -closest_points(mesh.boundary, points).distance
 
 
-def _followed(shape: Shape, matches: Correspondences, depth: Array) -> Shape:
-    """The lung after it followed matches at depth (n,) mm below the pleura, and its wall."""
-    anchors, rest, now = shape.anchors, shape.rest, shape.map.moved
+def _followed(shape: Shape, matches: Correspondences, depth: Array, smooth: Smoother) -> Shape:
+    """The lung after it followed matches at depth (n,) mm below the pleura, was smoothed, and followed its wall."""
+    anchors, rest = shape.anchors, shape.rest
     at = MeshMap(shape.map.mesh, rest.points, shape.map.around)(matches.moving)
-    offset, k = matches.fixed - shape.map(matches.moving), len(anchors)
-    sigma_mm = np.interp(depth, (SHALLOW_MM, DEEP_MM), SIGMA_MM)
-    nodes, gap, normals = _off_wall(shape)
-    wanted = PointConstraints(
-        np.concatenate([at, rest.points[anchors], rest.points[nodes]]),
-        np.concatenate([offset, np.zeros((k, 3)), gap[:, None] * normals]),
-        np.concatenate([sigma_mm, np.full(k, ANCHOR_SIGMA_MM), np.full(len(nodes), WALL_SIGMA_MM)]),
-        np.concatenate([np.zeros((len(at) + k, 3)), normals]),
+    followed = _pulled(
+        shape,
+        PointConstraints(
+            np.concatenate([at, rest.points[anchors]]),
+            np.concatenate([matches.fixed - shape.map(matches.moving), np.zeros((len(anchors), 3))]),
+            np.concatenate([np.interp(depth, (SHALLOW_MM, DEEP_MM), SIGMA_MM), np.full(len(anchors), ANCHOR_SIGMA_MM)]),
+            np.zeros((len(at) + len(anchors), 3)),
+        ),
+        smooth,
     )
-    field = elastic_correction(rest, now - rest.points, Tissue(), wanted, model_sigma=STRAIN, rounds=1).u
-    return shape.moved(now + unfolded(now, field, rest.tets))
+    return _beside_wall(followed)
+
+
+def _beside_wall(shape: Shape) -> Shape:
+    """The lung with its surface drawn to the wall; what lies deeper than SHALLOW_MM stays."""
+    rest, (nodes, gap, normals) = shape.rest, _off_wall(shape)
+    if len(nodes) == 0:
+        return shape
+    deep = np.flatnonzero(_depth(shape.map.mesh, shape.map.mesh.points) > SHALLOW_MM)
+    still = np.zeros((len(deep), 3))
+    wanted = PointConstraints(
+        rest.points[np.concatenate([deep, nodes])],
+        np.concatenate([still, gap[:, None] * normals]),
+        np.concatenate([np.full(len(deep), ANCHOR_SIGMA_MM), np.full(len(nodes), WALL_SIGMA_MM)]),
+        np.concatenate([still, normals]),
+    )
+    return _pulled(shape, wanted)
+
+
+def _pulled(shape: Shape, wanted: PointConstraints, smooth: Callable[[Array], Array] | None = None) -> Shape:
+    """The lung after it gave way to constraints elastically, and was smoothed; no element is turned over."""
+    rest, now = shape.rest, shape.map.moved
+    after = now + elastic_correction(rest, now - rest.points, Tissue(), wanted, model_sigma=STRAIN, rounds=1).u
+    if smooth is not None:
+        after = smooth(after)
+    return shape.moved(now + unfolded(now, after - now, rest.tets))
 
 
 def _off_wall(shape: Shape) -> tuple[Array, Array, Array]:
