@@ -40,7 +40,7 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         "breathing": {"arrays", "errors", "contact", "fem", "linalg", "mesh"},
     },
     "vatsloc": {
-        "ahead": set(),
+        "precompile": set(),
         "errors": set(),
         "frames": set(),
         "lazy": set(),
@@ -68,9 +68,9 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         "synthetic": {"errors", "frames", "lazy", "formats", "imaging", "workflow"},
         "study": {
             *("errors", "frames", "lazy", "maps", "terminal", "formats", "imaging", "case", "results", "report"),
-            *("workflow", "evaluation", "synthetic", "breathing", "ahead"),
+            *("workflow", "evaluation", "synthetic", "breathing", "precompile"),
         },
-        "listen_command": {"ahead", "terminal", "dicomnet", "workflow"},
+        "listen_command": {"precompile", "terminal", "dicomnet", "workflow"},
         "phantom_command": {"errors", "terminal", "synthetic", "study"},
         "cli": {
             *(
@@ -84,7 +84,7 @@ ROOMS: dict[str, dict[str, set[str]]] = {
                 "synthetic",
                 "study",
             ),
-            *("dicomout", "dicomnet", "navigation", "breathing", "ahead"),
+            *("dicomout", "dicomnet", "navigation", "breathing", "precompile"),
         },
         "__main__": {"cli"},
     },

@@ -16,10 +16,10 @@ import typer
 # other core, and sums that threads share round otherwise.
 os.environ["OPENBLAS_NUM_THREADS"] = "1"
 
-from vatsloc.ahead import compile_beside
 from vatsloc.errors import GateFailed, as_ours
 from vatsloc.listen_command import listen
 from vatsloc.phantom_command import phantom
+from vatsloc.precompile import compile_beside
 from vatsloc.study.commands import bench, calibrate_forecast, chart, cohort, paper, stability
 from vatsloc.terminal import JsonOption, LinkOption, PresetOption, SettingsOption, link, progress, say, show, show_line
 

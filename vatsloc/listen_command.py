@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from vatsloc.ahead import compile_beside
+from vatsloc.precompile import compile_beside
 from vatsloc.terminal import LinkOption, link, say, taking
 
 

@@ -19,6 +19,9 @@ RIDGE_MM2 = 2.0
 """Of the gradient, against the mean square of coordinates, and REACH_MM squared times as much of the curvature: points
 in a plane say nothing across it."""
 
+AT_ONCE = 1000
+"""Places whose polynomials are fitted together: a few thousand take more memory than the rest of a refinement."""
+
 
 @dataclass(frozen=True)
 class MovingLeastSquares:
@@ -41,16 +44,23 @@ class MovingLeastSquares:
 def moving_least_squares(points: Array, places: Array) -> MovingLeastSquares:
     """Weights that carry values at points (n, 3) mm to places (k, 3) mm by quadratic fits."""
     far, near = cKDTree(points).query(places, np.arange(1, min(NEIGHBOURS, len(points)) + 1))
+    weight = np.empty_like(far)
+    for some in np.array_split(np.arange(len(places)), len(places) // AT_ONCE + 1):
+        weight[some] = _weights(far[some], points[near[some]] - places[some, None])
+    return MovingLeastSquares(near, weight, points, places)
+
+
+def _weights(far: Array, off: Array) -> Array:
+    """Weights (k, m) of the points near each of k places, at distances (k, m) mm and by (k, m, 3) mm off."""
     closeness = np.exp(-0.5 * ((far - far[:, :1]) / REACH_MM) ** 2)
     closeness /= closeness.sum(axis=1, keepdims=True)
-    x = points[near] - places[:, None]
-    products = [x[..., a] * x[..., b] for a in range(3) for b in range(a, 3)]
-    terms = np.stack([np.ones_like(far), *np.moveaxis(x, 2, 0), *products], axis=1)
+    x = np.moveaxis(off, 2, 0)
+    products = [x[a] * x[b] for a in range(3) for b in range(a, 3)]
+    terms = np.stack([np.ones_like(far), *x, *products], axis=1)
     weighted = terms * closeness[:, None]
-    normal = weighted @ terms.transpose(0, 2, 1)
-    normal += np.diag([0.0] + 3 * [RIDGE_MM2] + 6 * [RIDGE_MM2 * REACH_MM**2])
-    at_place = np.linalg.solve(normal, np.eye(10)[:, :1])
-    return MovingLeastSquares(near, np.einsum("kam,ka->km", weighted, at_place[..., 0]), points, places)
+    normal = weighted @ terms.transpose(0, 2, 1) + np.diag([0.0, *3 * [RIDGE_MM2], *6 * [RIDGE_MM2 * REACH_MM**2]])
+    at_place = np.linalg.solve(normal, np.eye(10)[:, :1])[..., 0]
+    return np.asarray(np.einsum("kam,ka->km", weighted, at_place))
 
 
 def _affine(points: Array) -> Array:

@@ -98,7 +98,7 @@ class LeaveOutSettings(_Table):
     """
 
     first_registration_mm: float = Field(default=-1.0, ge=-1)
-    residual_mm: float = Field(default=-1.0, ge=-1)
+    residual_mm: float = Field(default=2.5, ge=-1)
     strained_share: float = Field(default=0.001, ge=-1)
     overlap_ml: float = Field(default=5.0, ge=-1)
 
@@ -149,7 +149,6 @@ PRESETS: dict[str, dict[str, Any]] = {
         "registration": {"grid_mm": 20.0, "levels": 3, "voxel_mm": 3.0},
         "mesh": {"edge_mm": 10.0, "model_edge_mm": 16.0},
         "refinement": {"cell_mm": 8.0},
-        "leave_out": {"residual_mm": 2.5},
     },
     "balanced": {},
     "accurate": {
@@ -157,8 +156,9 @@ PRESETS: dict[str, dict[str, Any]] = {
         "mesh": {"edge_mm": 6.0},
         "residual": {"grid_mm": 10.0, "voxel_mm": 1.5},
         "refinement": {"cell_mm": 3.5},
+        "leave_out": {"residual_mm": -1.0},
     },
-    "auto": {"leave_out": {"first_registration_mm": 10.0, "residual_mm": 2.5}},
+    "auto": {"leave_out": {"first_registration_mm": 10.0}},
 }
 
 

@@ -16,7 +16,7 @@ from typing import Any
 from numba import types
 from numba.core import event
 
-from vatsloc.ahead import Kernel, compile_beside
+from vatsloc.precompile import Kernel, compile_beside
 from vatsloc.study.bench.isolated import isolated
 from vatsloc.workflow.run import run_case
 from vatsloc.workflow.settings import load_settings

@@ -16,7 +16,7 @@ WITHOUT_MODEL = ("balanced", "elastic", "spline", "alone", "elastic-alone", "spl
 SCANS = {"balanced": "CT, inflated and deflated CBCT", "two-scans": "CT, deflated CBCT", "one-scan": "CT"}
 """Variants that differ in the scans they use."""
 AUTO, ITS_ALL = "auto", "balanced"
-"""The preset that leaves out, and the one that leaves nothing out."""
+"""The preset that leaves out most, and the one that it is held against."""
 
 
 def write_table(points: Sequence[Point], path: Path) -> None:

@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 from numba import njit
 
-from vatsloc import ahead
-from vatsloc.ahead import LIST, Kernel, compile_beside, listed
+from vatsloc import precompile
 from vatsloc.cli import main
+from vatsloc.errors import InputRefused
+from vatsloc.precompile import LIST, Kernel, compile_beside, listed
 from vatsloc.study.bench.cold import as_json, compiled_by
 
 TOY = """
@@ -94,14 +95,14 @@ def test_nothing_is_started_where_kernels_lie_on_disk_or_on_one_processor(
     kernel = compiled_by(lambda: _call(toy))[0]
     started: list[Path] = []
     monkeypatch.setattr(subprocess, "Popen", lambda *_, cwd, **__: started.append(cwd))
-    monkeypatch.setattr(ahead.atexit, "register", lambda *_: None)
+    monkeypatch.setattr(precompile.atexit, "register", lambda *_: None)
     monkeypatch.setattr(os, "cpu_count", lambda: 2)
-    monkeypatch.setattr(ahead, "listed", lambda: [kernel])
+    monkeypatch.setattr(precompile, "listed", lambda: [kernel])
     compile_beside()
     assert not started
     monkeypatch.setattr(Kernel, "is_compiled", False)
     compile_beside()
-    assert started == [Path(ahead.__file__).parents[1]], "this copy of the program, wherever the command was given"
+    assert started == [Path(precompile.__file__).parents[1]], "this copy of the program, wherever the command was given"
     monkeypatch.setattr(os, "cpu_count", lambda: 1)
     compile_beside()
     assert len(started) == 1
@@ -123,7 +124,7 @@ def test_a_run_goes_on_where_no_process_can_be_started(monkeypatch: pytest.Monke
 
 def test_the_process_ends_with_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
     ends: list[tuple[Callable[..., None], subprocess.Popen[bytes]]] = []
-    monkeypatch.setattr(ahead.atexit, "register", lambda end, process: ends.append((end, process)))
+    monkeypatch.setattr(precompile.atexit, "register", lambda end, process: ends.append((end, process)))
     monkeypatch.setattr(os, "cpu_count", lambda: 2)
     monkeypatch.setattr(Kernel, "is_compiled", False)
     compile_beside()
@@ -138,6 +139,25 @@ def test_commands_that_run_a_case_start_it(command: str, started: list[str], tmp
     started.clear()
     with pytest.raises(SystemExit):
         main([command, str(tmp_path / "no case"), "--out", str(tmp_path / "out")])
+    assert started == ["compile"]
+
+
+def test_the_demo_starts_it(started: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def refused(*_: object) -> None:
+        raise InputRefused("no phantom")
+
+    monkeypatch.setattr("vatsloc.synthetic.case.write_phantom", refused)
+    started.clear()
+    with pytest.raises(SystemExit):
+        main(["demo", "--out", str(tmp_path / "demo")])
+    assert started == ["compile"]
+
+
+def test_the_dicom_node_starts_it(started: list[str], tmp_path: Path) -> None:
+    pytest.importorskip("pynetdicom")
+    started.clear()
+    with pytest.raises(SystemExit):
+        main(["listen", "--port", "0", "--cases", str(tmp_path), "--send", "no port"])
     assert started == ["compile"]
 
 
