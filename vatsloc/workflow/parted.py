@@ -69,8 +69,7 @@ def in_pieces(
         stages.skip(PIECES, "held-out keypoints are not predicted better by a lung in two pieces")
         return pose, replace(collapse, fissure=fissure)
     pose, collapse = fitted
-    misfit_mm = collapse.model.held_out_mm
-    if not settings.residual.on or (misfit_mm is not None and misfit_mm <= settings.leave_out.residual_mm):
+    if not settings.residual.on:
         return pose, collapse
     with stages.stage(f"{PIECES}, residual registration"):
         return pose, _with_residual(prepared, pose, collapse, fissure, settings)
