@@ -1,6 +1,7 @@
 """The page in a browser: nothing asked of the network, no error, every viewer draws, sliders move the pictures.
 
-A probe, appended to a copy of the page, reads pixels after the page's own scripts and leaves numbers in the document.
+A probe, appended to a copy of the page, reads pixels a second after the page's own scripts, which paint coarsely until
+nothing has moved for a tenth of one, and leaves numbers in the document.
 """
 
 from __future__ import annotations
@@ -72,7 +73,7 @@ setTimeout(() => {
   const result = document.createElement("pre");
   result.id = "found"; result.textContent = JSON.stringify(found);
   document.body.append(result);
-}, 200);
+}, 1000);
 </script>"""
 
 
