@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from registration.maps.monomials import monomials
 from registration.volume import Array
 
 NEIGHBOURS = 160
@@ -54,9 +55,7 @@ def _weights(far: Array, off: Array) -> Array:
     """Weights (k, m) of the points near each of k places, at distances (k, m) mm and by (k, m, 3) mm off."""
     closeness = np.exp(-0.5 * ((far - far[:, :1]) / REACH_MM) ** 2)
     closeness /= closeness.sum(axis=1, keepdims=True)
-    x = np.moveaxis(off, 2, 0)
-    products = [x[a] * x[b] for a in range(3) for b in range(a, 3)]
-    terms = np.stack([np.ones_like(far), *x, *products], axis=1)
+    terms = np.stack(monomials(np.moveaxis(off, 2, 0), 2), axis=1)
     weighted = terms * closeness[:, None]
     normal = weighted @ terms.transpose(0, 2, 1) + np.diag([0.0, *3 * [RIDGE_MM2], *6 * [RIDGE_MM2 * REACH_MM**2]])
     at_place = np.linalg.solve(normal, np.eye(10)[:, :1])[..., 0]
@@ -64,4 +63,4 @@ def _weights(far: Array, off: Array) -> Array:
 
 
 def _affine(points: Array) -> Array:
-    return np.column_stack([np.ones(len(points)), points])
+    return np.stack(monomials(points.T, 1), axis=1)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from poro.fit import PointConstraints
 from poro.mesh.tetmesh import TetMesh, signed_volumes
 from registration.correspondences import Correspondences
 from registration.volume import Array, Mask
@@ -219,6 +220,18 @@ def test_no_element_is_turned_over_by_blocks_that_would_turn_it(pulls: int) -> N
     followed = module._followed(shape, pulled, module._depth(Lung.mesh, pulled.moving), unsmoothed)
     assert (signed_volumes(followed.map.moved, Lung.mesh.tets) > 0).all()
     assert (np.linalg.norm(followed.map(aside) - shape.map(aside), axis=1) > 3.0).all()
+
+
+def test_no_element_is_turned_over_by_smoothing() -> None:
+    """Nodes scattered by what is meant to smooth them."""
+    shape = Shape(Lung.rest, MeshMap(Lung.mesh, Lung.truth, AROUND), np.zeros(0, int))
+    still = PointConstraints(Lung.rest.points[:20], np.zeros((20, 3)), np.ones(20), np.zeros((20, 3)))
+    scatter = np.random.default_rng(3).normal(0, 6.0, Lung.truth.shape)
+    turned = signed_volumes(Lung.truth + scatter, Lung.mesh.tets) <= 0
+    found = module._pulled(shape, still, lambda points: points + scatter).map.moved
+    assert turned.any()
+    assert (signed_volumes(found, Lung.mesh.tets) > 0).all()
+    assert np.linalg.norm(found - Lung.truth, axis=1).max() > 2.0
 
 
 def test_only_nodes_of_elements_that_would_turn_over_follow_less() -> None:

@@ -15,6 +15,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from poro.mesh.pieces import Pieces
+from registration.maps.monomials import monomials
 from registration.volume import Array
 from vatsloc.workflow.bend import Bend, bend_to
 
@@ -188,8 +189,7 @@ class _Scene:
 
 def _terms(points: Array) -> Array:
     """1, the coordinates and their products, (n, 10)."""
-    x = points / SCALE_MM
-    return np.stack([np.ones(len(x)), *x.T, *(x[:, a] * x[:, b] for a in range(3) for b in range(a, 3))], axis=1)
+    return np.stack(monomials((points / SCALE_MM).T, 2), axis=1)
 
 
 def smooth_map(points: Array, motion: Array, degree: int = 2) -> Array:

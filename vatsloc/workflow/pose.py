@@ -15,6 +15,7 @@ from poro.mesh.tetmesh import signed_volumes
 from registration.ffd import FfdFit, FfdSettings, Weights
 from registration.images.resample import coarsen_mask
 from registration.maps.inversion import Inversion, invert_at
+from registration.maps.monomials import monomials
 from registration.maps.rigid import RigidTransform
 from registration.sliding import LungImage, SlidingFit, register_sliding
 from registration.spine import RigidFit, SpineSearch, register_spine
@@ -208,21 +209,13 @@ def _laid_out(placed: TetMesh, points: Array, believed: Array) -> Array:
     """
     centre = placed.points.mean(axis=0)
     for degree in (2, 1):
-        terms = _monomials((placed.points - centre) / POLYNOMIAL_MM, degree)
+        terms = np.stack(monomials(((placed.points - centre) / POLYNOMIAL_MM).T, degree), axis=1)
         if believed.sum() < 4 * terms.shape[1]:
             continue
         laid_out = terms @ np.linalg.lstsq(terms[believed], points[believed], rcond=None)[0]
         if (signed_volumes(laid_out, placed.tets) > LEAST_STRETCH * placed.volumes).all():
             return np.asarray(laid_out)
     return placed.points
-
-
-def _monomials(x: Array, degree: int) -> Array:
-    """1, the coordinates and, for degree 2, their products, (n, 4) or (n, 10)."""
-    terms = [np.ones(len(x)), *x.T]
-    if degree == 2:
-        terms += [x[:, a] * x[:, b] for a in range(3) for b in range(a, 3)]
-    return np.stack(terms, axis=1)
 
 
 def ffd_settings(settings: RegistrationSettings) -> FfdSettings:

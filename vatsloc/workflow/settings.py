@@ -92,7 +92,7 @@ class LeaveOutSettings(_Table):
     """Up to which value, measured on the scene, a part is left out.
 
     first_registration_mm: how far 95 % of the keypoints inside the lung moved against the spine; residual_mm: median
-    misfit of the model at held-out keypoints; strained_share: of elements beyond the range of linear strain
+    misfit of a lung in one piece at held-out keypoints; strained_share: of elements beyond the range of linear strain
     (finite strain); overlap_ml: volume that two pieces share (contact between pieces). -1 keeps a part whatever is
     seen.
     """
