@@ -13,6 +13,9 @@ from poro.contact.active_set import ContactState, ContactStatus, solve_contact
 from poro.contact.sensitivity import contact_sensitivity
 from poro.mesh.tetmesh import signed_volumes
 
+NEARBY_PIVOTS = 40
+"""Of the contact from a solution nearby, which takes 5 to 30."""
+
 
 class PoroStatus(Enum):
     """How a forward solution ended."""
@@ -56,6 +59,22 @@ def solve(system: PoroSystem, theta: Theta, start: PoroState | None = None, tole
     """
     p, free = without_wall(system, theta)
     contact = contact_at(system, theta, free, start.contact if start else None, tolerance_mm)
+    return _with_wall(system, theta, p, free, contact)
+
+
+def solve_nearby(system: PoroSystem, theta: Theta, start: PoroState) -> PoroState:
+    """The same near a solution that is known, without the patience for what lies far from it: `NOT_CONVERGED` where the
+    contact does not settle at once.
+    """
+    p, free = without_wall(system, theta)
+    there = free[system.contact_nodes]
+    contact = solve_contact(
+        system.compliance, system.wall, there, theta.d_diaph_mm, start.contact, most_pivots=NEARBY_PIVOTS
+    )
+    return _with_wall(system, theta, p, free, contact)
+
+
+def _with_wall(system: PoroSystem, theta: Theta, p: Array, free: Array, contact: ContactState) -> PoroState:
     return state_of(system, theta, p, free + system.solid.solve(wall_forces(system, contact)), contact)
 
 

@@ -87,12 +87,14 @@ def solve_contact(
     tolerance_mm: float = 1e-3,
     max_steps: int = 30,
     facing: Facing | None = None,
+    most_pivots: int = ALL_PIVOTS,
 ) -> ContactState:
     """Contact forces that keep every node in front of the wall, for the displacements `free` (nc, 3) without any wall.
 
     The gap is linearized where the nodes are and one exchange of the active set made, until no node moves by more than
     `tolerance_mm` and the set stays; where that takes long, every linear complementarity problem is solved to its end.
-    facing: two surfaces among the contact nodes that may not pass through each other either.
+    facing: two surfaces among the contact nodes that may not pass through each other either. most_pivots: after which it
+    is given up, `STOPPED`.
     """
     u = start.u if start else np.zeros_like(free)
     rows = len(free) + (len(facing.nodes) if facing else 0)
@@ -101,7 +103,7 @@ def solve_contact(
     moves: list[float] = []
     pivots, pivoted, status = 0, False, ContactStatus.STOPPED
     anderson = Anderson()
-    while len(moves) < max_steps and pivots < ALL_PIVOTS:
+    while len(moves) < max_steps and pivots < most_pivots:
         gap, gradient, hessian = wall.gap(u, travel_mm)
         stiffness = geometric_stiffness(compliance, wall.rest, force[: len(free)], hessian)
         between = facing.gaps(u) if facing else None
@@ -109,7 +111,9 @@ def solve_contact(
         active = linear.within(active)
         quick = len(moves) < QUICK_STEPS and (start is not None or len(moves) > 0)
         before = active
-        force, active, target, used, status = linear_complementarity(linear, active, 1 if quick else MAX_PIVOTS)
+        force, active, target, used, status = linear_complementarity(
+            linear, active, 1 if quick else min(MAX_PIVOTS, most_pivots - pivots)
+        )
         pivots += used
         pivoted = pivoted or status is ContactStatus.PIVOTED
         moves.append(float(np.linalg.norm(target - u, axis=1).max(initial=0)))

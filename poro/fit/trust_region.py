@@ -10,11 +10,12 @@ from scipy.optimize import lsq_linear
 
 from poro.arrays import Array
 from poro.collapse.model import Theta
-from poro.collapse.solution import PoroState, PoroStatus, sensitivity, solve
+from poro.collapse.solution import PoroState, PoroStatus, sensitivity, solve, solve_nearby
 from poro.fit.problem import FitProblem, bounds
 
 DAMPING = 1e-6  # of the normal equations' diagonal, against directions that no datum sees
 SMALLEST = 1e-3  # share of the longest step at which a refused step ends the descent
+MOST_UNSETTLED = 4  # trials whose contact does not settle, after which the descent ends: they are the dearest by far
 
 
 @dataclass(frozen=True)
@@ -54,6 +55,7 @@ def descend(problem: FitProblem, theta: Array) -> Descent:
     cost = problem.cost(rows, problem.whiten(rows), theta)
     radius = 1.0
     history = [FitStep(cost, radius, theta, True)]
+    unsettled = 0
     normal, slope = problem.normal_equations(rows, sensitivity(problem.system, state), theta)
     for _ in range(problem.settings.max_steps):
         near = np.maximum(low, theta - radius * scale), np.minimum(high, theta + radius * scale)
@@ -61,11 +63,15 @@ def descend(problem: FitProblem, theta: Array) -> Descent:
         promised = -(slope + 0.5 * normal @ step) @ step
         if promised <= 0.1 * tolerance * cost:
             return Descent(theta, state, tuple(history), True)
-        trial_state = solve(problem.system, Theta.of(theta + step), state)
+        trial_state = solve_nearby(problem.system, Theta.of(theta + step), state)
         trial_rows = problem.observer.residuals(trial_state.u)
         trial_cost = problem.cost(trial_rows, problem.whiten(trial_rows), theta + step)
-        accepted = trial_cost < cost and trial_state.status is not PoroStatus.NOT_CONVERGED
+        settled = trial_state.status is not PoroStatus.NOT_CONVERGED
+        accepted = trial_cost < cost and settled
         history.append(FitStep(trial_cost if accepted else cost, radius, theta + step, accepted))
+        unsettled += not settled
+        if unsettled == MOST_UNSETTLED:
+            break
         if not accepted:
             radius = 0.3 * min(radius, float(np.abs(step / scale).max()))
             if radius < SMALLEST:

@@ -15,7 +15,7 @@ from shapes import ellipsoid
 from poro.arrays import Array
 from poro.collapse import PoroState, PoroStatus, PoroSystem, Theta, assemble, hilum_modes, solve, uniform_strain_modes
 from poro.collapse.modes import LoadMode, eigenstrain_mode
-from poro.collapse.solution import sensitivity
+from poro.collapse.solution import sensitivity, solve_nearby
 from poro.fem import Tissue
 from poro.fit import Fit, FitSettings, FitStatus, Target, ellipsoid95, fit_collapse, identifiability, point_covariance
 from poro.fit.identifiability import THETA_NAMES
@@ -64,6 +64,17 @@ def test_more_evacuation_means_less_volume_and_more_weight_more_sag(system: Poro
     assert volume[0] > volume[1] > volume[2]
     sag = [solve(system, Theta(1e-9, phi)).u[:, 0].mean() for phi in (0.9, 0.6)]
     assert sag[1] < sag[0] < 0.5
+
+
+def test_a_solution_nearby_is_the_same_and_one_far_off_is_not_waited_for(
+    system: PoroSystem, truth: PoroState, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    theta = Theta(2.2e-8, 0.83, 6.5)
+    near, known = solve_nearby(system, theta, truth), solve(system, theta, truth)
+    assert near.status is PoroStatus.SOLVED
+    assert_allclose(near.u, known.u, atol=1e-9)
+    monkeypatch.setattr("poro.collapse.solution.NEARBY_PIVOTS", 1)
+    assert solve_nearby(system, theta, truth).status is PoroStatus.NOT_CONVERGED
 
 
 def test_sensitivity_equals_finite_differences(system: PoroSystem, truth: PoroState) -> None:

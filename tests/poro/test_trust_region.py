@@ -11,7 +11,7 @@ import pytest
 from poro.arrays import Array
 from poro.collapse import PoroStatus, Theta
 from poro.fit import trust_region
-from poro.fit.trust_region import Descent, bounded_step, descend
+from poro.fit.trust_region import MOST_UNSETTLED, Descent, bounded_step, descend
 
 FREE = np.array([False, False, True])
 
@@ -38,6 +38,7 @@ def descent(monkeypatch: pytest.MonkeyPatch, lost_within: float) -> Descent:
         normal_equations=normal_equations,
     )
     monkeypatch.setattr(trust_region, "solve", solved)
+    monkeypatch.setattr(trust_region, "solve_nearby", solved)
     monkeypatch.setattr(trust_region, "sensitivity", lambda *_: None)
     monkeypatch.setattr(trust_region, "bounds", lambda _: (np.full(3, -np.inf), np.full(3, np.inf)))
     return descend(problem, np.array([0.0, 0.5, 2.0]))
@@ -56,6 +57,13 @@ def test_a_step_to_a_state_that_did_not_converge_is_refused(monkeypatch: pytest.
     found = descent(monkeypatch, 0.5)
     assert found.state.status is PoroStatus.SOLVED
     assert 0.5 <= abs(found.theta[2]) < 2.0
+
+
+def test_a_descent_ends_after_a_few_trials_whose_contact_does_not_settle(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = descent(monkeypatch, 1.9)
+    assert sum(abs(step.theta[2]) < 1.9 for step in found.history) == MOST_UNSETTLED
+    assert not found.converged
+    assert abs(found.theta[2]) >= 1.9
 
 
 def boxed(seed: int, free: Array) -> tuple[Array, Array, Array, Array, Array]:

@@ -192,7 +192,10 @@ def test_images_of_two_states_are_registered_there_and_back(tmp_path: Path, monk
     assert [row["from_mm"] for row in classes][:3] == [0.0, 5.0, 10.0]
     assert all(row["motion"]["mean"] > 2 for row in classes)
     # A third of a voxel at the pleura, a sixth below.
-    assert all(row["there_and_back"]["mean"] < (1.0 if row["from_mm"] < 10 else 0.5) for row in classes)
+    for way in ("there_and_back", "phase1"):
+        assert all(row[way]["mean"] < (1.0 if row["from_mm"] < 10 else 0.5) for row in classes)
+        assert all(row[way]["mean"] > 0.01 for row in classes)
+    assert classes[0]["phase1"] != classes[0]["there_and_back"]
     assert found["agreed_share"] > 0.8
     assert found["elastix_version"] is None
     # The squeeze is an affine map, which the fit to the shape finds and a lung at rest does not.

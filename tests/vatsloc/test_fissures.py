@@ -59,20 +59,28 @@ def test_few_keypoints_tell_nothing() -> None:
 @pytest.mark.parametrize(
     ("fissure", "evidence"),
     [
-        (Fissure(TRUE, 0.75, 40, 0.6, 400), ("keypoints", "gas")),
-        (Fissure(TRUE, 0.76, 40, 0.6, 400), ("gas",)),
-        (Fissure(TRUE, 0.75, 39, 0.6, 400), ("keypoints",)),
-        (Fissure(TRUE, 0.75, 40, 0.59, 400), ("keypoints",)),
-        (Fissure(TRUE, 0.95, 40, 0.67, 400), ("keypoints", "gas")),
-        (Fissure(TRUE, 0.95, 40, 0.66, 400), ("gas",)),
-        (Fissure(TRUE, 0.95, 39, 0.67, 400), ()),
-        (Fissure(TRUE, 0.96, 40, 0.67, 400), ("gas",)),
-        (Fissure(TRUE, 0.75, 60, 0.6, 2000), ("keypoints", "gas")),
-        (Fissure(TRUE, 0.75, 59, 0.6, 2000), ("keypoints",)),
+        (Fissure(TRUE, 0.95, 40, 0.45, 400), ("keypoints", "gas")),
+        (Fissure(TRUE, 0.96, 40, 0.45, 400), ("gas",)),
+        (Fissure(TRUE, 0.76, 39, 0.45, 400), ()),
+        (Fissure(TRUE, 0.75, 39, 0.45, 400), ("keypoints",)),
+        (Fissure(TRUE, 0.75, 40, 0.44, 400), ("keypoints",)),
+        (Fissure(TRUE, 0.95, 40, 0.44, 400), ()),
+        (Fissure(TRUE, 0.95, 60, 0.45, 2000), ("keypoints", "gas")),
+        (Fissure(TRUE, 0.75, 59, 0.45, 2000), ("keypoints",)),
     ],
 )
 def test_evidence_has_limits(fissure: Fissure, evidence: tuple[str, ...]) -> None:
     assert fissure.evidence == evidence
+
+
+@pytest.mark.parametrize(
+    ("cost_share", "gas_share", "most_misfit"),
+    [(0.75, 0.67, 1.0), (0.76, 0.67, 0.95), (0.75, 0.66, 0.88), (0.95, 0.45, 0.88)],
+)
+def test_the_weaker_the_evidence_the_more_hold_out_has_to_say(
+    cost_share: float, gas_share: float, most_misfit: float
+) -> None:
+    assert Fissure(TRUE, cost_share, 40, gas_share, 400).most_misfit == most_misfit
 
 
 def test_a_sheet_is_a_distance_for_planes_and_positive_above() -> None:

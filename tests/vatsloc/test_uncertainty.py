@@ -3,7 +3,7 @@ nearby allows."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -16,11 +16,13 @@ from registration.correspondences import Correspondences
 from registration.maps.rigid import RigidTransform
 from vatsloc.workflow.uncertainty import (
     BLOCK_REACH_MM,
+    KEYPOINT_MM,
     LEAST_MM,
     MODEL_ALONE_MM,
     NEAREST_BLOCKS,
     PER_BLOCK_MISFIT,
     PER_BLOCK_MM,
+    PER_CONTRADICTION,
     SHEET_FACTOR,
     block_sigma_mm,
     correspondence_sigma_mm,
@@ -149,8 +151,12 @@ def test_keypoints_that_a_lung_misses_although_it_followed_blocks_make_it_less_s
     at = np.array([[-20.0, -4, 0], [-20.0, 4, 0]])
     blocks = Correspondences.of(at + np.array([0, 0, 0.5]), at)
     missed = np.array([[0.0, 6.0, 0.0], [2.0, 0.0, 0.0]])
-    (found,) = Scene(ball, keypoints=at, missed=missed, blocks=blocks).covariance([-20, 0, 0.5])
-    assert_allclose(found, (1.5 * (4.0 - 1.0)) ** 2 * np.eye(3), rtol=1e-9)
+    scene = Scene(ball, keypoints=at, missed=missed, blocks=blocks)
+    (found,) = scene.covariance([-20, 0, 0.5])
+    sigma = np.hypot(PER_BLOCK_MISFIT * 0.5, PER_CONTRADICTION * (4.0 - KEYPOINT_MM))
+    assert_allclose(found, sigma**2 * np.eye(3), rtol=1e-9)
+    told = replace(scene, missed=missed * KEYPOINT_MM / 4.0)
+    assert_allclose(told.covariance([-20, 0, 0.5]), [(PER_BLOCK_MISFIT * 0.5) ** 2 * np.eye(3)], rtol=1e-9)
 
 
 def test_blocks_of_the_other_side_of_a_sheet_tell_nothing_where_a_lung_came_apart_and_is_not_cut(ball: TetMesh) -> None:

@@ -24,7 +24,7 @@ from registration.volume import Array, Mask
 from vatsloc.maps import MeshMap, covered
 from vatsloc.workflow.fissures import COVERED_MM, Fissure, Parted, mapped, smooth_map
 from vatsloc.workflow.hold_out import held_out
-from vatsloc.workflow.model_selection import GAIN, Refinement, fit_settings, misfit
+from vatsloc.workflow.model_selection import Refinement, fit_settings, misfit
 from vatsloc.workflow.observe import Observed
 from vatsloc.workflow.pneumothorax import Collapse, residual_of_part
 from vatsloc.workflow.pose import ChangeOfPose
@@ -60,13 +60,13 @@ def in_pieces(
         return pose, collapse
     with stages.stage(PIECES):
         fissure = stages.done(partial(seen_fissure, pose, collapse.observed, collapse.model.correspondences))
-    if fissure is None or len(fissure.evidence) < 2 or fissure.is_bare or fissure.is_vague:
+    if fissure is None or len(fissure.evidence) < 2 or fissure.is_bare:
         stages.skip(PIECES, _why(fissure))
         return pose, replace(collapse, fissure=fissure)
     with stages.stage(f"{PIECES}, fit"):
         fitted = _fitted(prepared, pose, collapse, fissure, settings)
     if fitted is None:
-        stages.skip(PIECES, "held-out keypoints are not predicted better by a lung in two pieces")
+        stages.skip(PIECES, f"held-out keypoints are not predicted {_by_enough(fissure)} by a lung in two pieces")
         return pose, replace(collapse, fissure=fissure)
     pose, collapse = fitted
     if not settings.residual.on:
@@ -83,6 +83,11 @@ def _why(fissure: Fissure | None) -> str:
     cost, share = f"{fissure.cost_share:.2f}", f"{100 * fissure.gas_share:.0f} %"
     gas = f"{fissure.gas} points of gas, {100 * fissure.gas / max(fissure.border, 1):.1f} % of its border,"
     return f"two smooth maps cost {cost} of one at keypoints, {share} of {gas} lie along a sheet"
+
+
+def _by_enough(fissure: Fissure) -> str:
+    least = 100 * (1 - fissure.most_misfit)
+    return f"better by {least:.0f} %" if least else "better"
 
 
 def cut_lung(prepared: Prepared, fissure: Fissure, edge_mm: float) -> Pieces:
@@ -124,7 +129,7 @@ def _fitted(
         return None
     best = min(trials, key=lambda name: trials[name][0])
     after_mm, training_only = trials[best]
-    if not after_mm < GAIN * before_mm:
+    if not after_mm < fissure.most_misfit * before_mm:
         return None
     u = _displaced(layout, observed, found, np.ones(len(found), dtype=bool), best, settings)
     if u is None:

@@ -27,17 +27,15 @@ NEAREST, PER_MISFIT, REACH_MM, PER_MM = 6, 1.5, 8.0, 0.15
 average, and PER_MM for every millimetre beyond REACH_MM from the nearest one. Quantile regression (95 %) of the
 chain's errors at 16,000 tissue points of the three twins and of five phantoms outside the suite (adhesion 205,
 near-total-collapse 206, part-solid 207, base 208, poor-dose 209)."""
-KEYPOINT_MM = 1.0
-"""What keypoints are off by themselves: half of the voxel that they are matched on. Where a lung that followed blocks
-misses the keypoints about it by more, one of both is wrong: on twin-e, a lung in lobes that is not cut, the radius then
-holds 90 to 92 % deeper than 5 mm instead of 81 to 87 %, and hardly grows on twin-c and twin-d. All three were in sight
-when this was chosen."""
-
-NEAREST_BLOCKS, PER_BLOCK_MISFIT, BLOCK_REACH_MM, PER_BLOCK_MM = 12, 1.0, 3.0, 0.33
-"""The same where the lung followed small blocks: PER_BLOCK_MISFIT for every millimetre by which it misses the twelve
-nearest ones on average, PER_BLOCK_MM for every millimetre beyond BLOCK_REACH_MM from their middle, which is far where
-all lie to one side. Quantile regression (95 %) at tissue points of phantoms outside the suite (base 505,
-near-total-collapse 506, left 504, a twin of a real chest 501)."""
+NEAREST_BLOCKS, PER_BLOCK_MISFIT, BLOCK_REACH_MM, PER_BLOCK_MM = 12, 0.7, 4.0, 0.3
+"""The same where the lung followed small blocks and was smoothed: PER_BLOCK_MISFIT for every millimetre by which it
+misses the twelve nearest ones on average, PER_BLOCK_MM for every millimetre beyond BLOCK_REACH_MM from their middle,
+which is far where all lie to one side."""
+KEYPOINT_MM, PER_CONTRADICTION = 1.5, 2.5
+"""What is added to that, as independent errors are, where such a lung misses the keypoints about it: PER_CONTRADICTION
+for every millimetre beyond KEYPOINT_MM, which they are off by themselves. One of both is wrong there. All six are the
+smallest radius that holds 93 % of the tissue in every class of depth of each of twelve phantoms outside the suite and a
+twin of a real chest, with a margin (docs/method.md)."""
 SHEET_MM, SHEET_FACTOR = 8.0, 1.4
 """How far from a cut tissue may belong to the other piece, since a bowed sheet is not where the fissure is everywhere,
 and by how much the ellipsoid reaches beyond where that went: it holds 96 % of the tissue beside the cuts of base 505
@@ -83,11 +81,11 @@ def _covariance(pose: ChangeOfPose, collapse: Collapse, inflated: Array, deflate
     blocks = None if collapse.refinement is None else collapse.refinement.followed
     if blocks is None:
         return _of_fit(pose, collapse, inflated, deflated)
-    sigma_mm = block_sigma_mm(*nearest_blocks(pose, collapse, blocks, inflated, deflated))
+    variance = block_sigma_mm(*nearest_blocks(pose, collapse, blocks, inflated, deflated)) ** 2
     if collapse.model.refinements:
         missed = nearest_correspondences(collapse, deflated)[1]
-        sigma_mm = np.maximum(sigma_mm, PER_MISFIT * np.maximum(missed - KEYPOINT_MM, 0.0))
-    return np.asarray(sigma_mm[:, None, None] ** 2 * np.eye(3) + _beside_cut(pose, collapse, inflated))
+        variance = variance + (PER_CONTRADICTION * np.maximum(missed - KEYPOINT_MM, 0.0)) ** 2
+    return np.asarray(variance[:, None, None] * np.eye(3) + _beside_cut(pose, collapse, inflated))
 
 
 def _beside_cut(pose: ChangeOfPose, collapse: Collapse, inflated: Array) -> Array:
