@@ -20,7 +20,8 @@ from poro.breathing.inflation import Filled, fill_to
 from poro.fem.constitutive import ConstitutiveModel
 from poro.fem.hyperelastic import ogden_lung
 from poro.fem.tissue import GRAVITY_KPA_PER_MM, Tissue
-from poro.mesh.tetmesh import TetMesh, TriSurface
+from poro.mesh.tetmesh import TetMesh
+from poro.mesh.trisurface import TriSurface
 
 APEX_SHARE, FLANK_SHARE, SPINE_SHARE = 0.08, (0.1, 0.7), 0.4
 """Shares of the lung's height or depth: apex from the top; flanks, height from the bottom; spine from the back."""

@@ -24,6 +24,7 @@ GAP_TOLERANCE_MM = 1e-9
 QUICK_STEPS = 10  # linearizations in which the active set is exchanged once, as in a semismooth Newton method
 MAX_PIVOTS = 80  # of later ones, and of the first, which knows no active set
 ALL_PIVOTS = 200  # of all linearizations; lungs that converge take 5 to 30, lost ones would go on for thousands
+MAX_STEPS = 30  # linearizations in all
 MIX_MM = 5.0  # steps below it, which what the geometric stiffness misses makes alike, are accelerated
 MIX_FLIPS = 20  # nodes that may come and go meanwhile: some always do where the lung creeps along the wall
 MAX_MOVE_MM = 20.0  # largest step over which a linearized wall is believed
@@ -85,7 +86,6 @@ def solve_contact(
     travel_mm: float,
     start: Guess | ContactState | None = None,
     tolerance_mm: float = 1e-3,
-    max_steps: int = 30,
     facing: Facing | None = None,
     most_pivots: int = ALL_PIVOTS,
 ) -> ContactState:
@@ -93,8 +93,8 @@ def solve_contact(
 
     The gap is linearized where the nodes are and one exchange of the active set made, until no node moves by more than
     `tolerance_mm` and the set stays; where that takes long, every linear complementarity problem is solved to its end.
-    facing: two surfaces among the contact nodes that may not pass through each other either. most_pivots: after which it
-    is given up, `STOPPED`.
+    facing: two surfaces among the contact nodes that may not pass through each other either. most_pivots: after which
+    it is given up, `STOPPED`.
     """
     u = start.u if start else np.zeros_like(free)
     rows = len(free) + (len(facing.nodes) if facing else 0)
@@ -103,7 +103,7 @@ def solve_contact(
     moves: list[float] = []
     pivots, pivoted, status = 0, False, ContactStatus.STOPPED
     anderson = Anderson()
-    while len(moves) < max_steps and pivots < most_pivots:
+    while len(moves) < MAX_STEPS and pivots < most_pivots:
         gap, gradient, hessian = wall.gap(u, travel_mm)
         stiffness = geometric_stiffness(compliance, wall.rest, force[: len(free)], hessian)
         between = facing.gaps(u) if facing else None

@@ -13,7 +13,7 @@ from scipy.sparse import csr_matrix, diags
 
 from poro.arrays import Array
 from poro.contact.mortar import Reach, mortar
-from poro.mesh.tetmesh import TriSurface
+from poro.mesh.trisurface import TriSurface
 
 REACH = Reach(apart=10.0, deep=10.0)
 """Deeper in each other, a thin piece's back would be taken for a front."""

@@ -10,7 +10,7 @@ from scipy import ndimage
 
 from poro.arrays import Array
 from poro.mesh.closest import closest_points
-from poro.mesh.tetmesh import TriSurface
+from poro.mesh.trisurface import TriSurface
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,8 @@ from scipy.spatial import cKDTree
 from poro.arrays import Array
 from poro.mesh.closest import ClosestPoints, closest_points
 from poro.mesh.locate import Location, interpolate, locate
-from poro.mesh.tetmesh import TetMesh, TriSurface
+from poro.mesh.tetmesh import TetMesh
+from poro.mesh.trisurface import TriSurface
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,8 @@ from poro.mesh.locate import interpolate, locate
 from poro.mesh.patches import patches
 from poro.mesh.rasterize import rasterize
 from poro.mesh.stuffing import signed_distance, stuff, stuff_level_set
-from poro.mesh.tetmesh import TetMesh, TriSurface, quality, surface
+from poro.mesh.tetmesh import TetMesh, quality, surface
+from poro.mesh.trisurface import TriSurface
 
 __all__ = [
     "TetMesh",

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from poro.arrays import Array
 from poro.mesh.parts import share_out
-from poro.mesh.tetmesh import TriSurface
+from poro.mesh.trisurface import TriSurface
 
 CLUSTER = 8  # triangles per bounding sphere
 FEW = 1000  # queries that one thread answers sooner than two
@@ -61,6 +61,11 @@ def closest_points(surface: TriSurface, queries: Array) -> ClosestPoints:
     normal = np.where((bary.min(axis=1) > 1e-9)[:, None], surface.normals[triangle], normal)
     sign = np.where(np.einsum("qd,qd->q", offset, normal) < 0, -1.0, 1.0)
     return ClosestPoints(points, triangle, bary, sign * np.linalg.norm(offset, axis=1))
+
+
+def depth_below(surface: TriSurface, points: Array) -> Array:
+    """How deep points (q, 3) mm lie below a closed surface, (q,) mm; negative outside it."""
+    return -closest_points(surface, points).distance
 
 
 class _Clusters(NamedTuple):

@@ -10,7 +10,8 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from poro.arrays import Array
-from poro.mesh.tetmesh import TetMesh, TriSurface
+from poro.mesh.tetmesh import TetMesh
+from poro.mesh.trisurface import TriSurface
 
 # Cosines of the tilt up to which a face still counts as looking down, or inward.
 DOWN, INWARD = 0.5, 0.35

@@ -175,24 +175,18 @@ def fitted(slid_mm: float, before_mm: float, fissure: Fissure = FLAT) -> tuple[C
     scene, rng = known.scene(), np.random.default_rng(3)
     keypoints = known.CENTRE + rng.uniform(-18, 18, (200, 3))
     moving = BEFORE_FROM_CT(keypoints)
-    slid = apart(slid_mm)[(keypoints[:, 2] < known.CENTRE[2]).astype(int)]
+    apart = np.array([[slid_mm, 0, 3], [-slid_mm, 0, 3]])  # mm, of what lies above the fissure and below it
     unseen = scene.collapse.observed.surface.where(np.zeros(14, bool))
     whole = (Refinement("elastic correction", 20.0, before_mm, True),)
-    told = Correspondences.of(moving + slid, moving)
+    told = Correspondences.of(moving + apart[(keypoints[:, 2] < known.CENTRE[2]).astype(int)], moving)
     scene = scene.with_model(correspondences=told, refinements=whole).with_observed(surface=unseen)
     settings = Settings.model_validate({"mesh": {"edge_mm": 12.0, "model_edge_mm": 14.0}})
     return _fitted(scene.prepared, scene.pose, scene.collapse, fissure, settings)
 
 
-def apart(slid_mm: float) -> Array:
-    """Motion (2, 3) mm of what lies above the fissure and below it."""
-    return np.array([[slid_mm, 0, 3], [-slid_mm, 0, 3]])
-
-
 def test_a_lung_is_fitted_in_pieces_where_each_of_them_went_its_own_way_and_only_there() -> None:
-    slid_mm = 8.0  # one piece can do no better
     assert fitted(0.0, 0.0) is None
-    found = fitted(slid_mm, slid_mm)
+    found = fitted(8.0, 8.0)  # one piece can do no better
     assert found is not None
     collapse = found[1]
     assert collapse.parted is not None
@@ -202,9 +196,9 @@ def test_a_lung_is_fitted_in_pieces_where_each_of_them_went_its_own_way_and_only
     for number in (0, 1):
         mine = clear & (pieces.node_piece() == number)
         assert mine.sum() > 10
-        assert_allclose(moved[mine], np.broadcast_to(apart(slid_mm)[number], (mine.sum(), 3)), atol=0.4)
-    assert collapse.model.refinements[0] == Refinement("elastic correction", 20.0, slid_mm, True)
-    assert collapse.model.refinements[1].before_mm == slid_mm
+        assert_allclose(moved[mine], np.broadcast_to([8.0 * (1 - 2 * number), 0, 3], (mine.sum(), 3)), atol=0.4)
+    assert collapse.model.refinements[0] == Refinement("elastic correction", 20.0, 8.0, True)
+    assert collapse.model.refinements[1].before_mm == 8.0
     assert collapse.model.refinements[1].after_mm < 0.1
 
 

@@ -10,6 +10,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from poro.fit import PointConstraints
+from poro.mesh.closest import depth_below
 from poro.mesh.tetmesh import TetMesh, signed_volumes
 from registration.correspondences import Correspondences
 from registration.volume import Array, Mask
@@ -217,7 +218,7 @@ def test_no_element_is_turned_over_by_blocks_that_would_turn_it(pulls: int) -> N
         ),
         np.concatenate([np.repeat(corners, pulls, axis=0), np.repeat(aside, 60, axis=0)]),
     )
-    followed = module._followed(shape, pulled, module._depth(Lung.mesh, pulled.moving), unsmoothed)
+    followed = module._followed(shape, pulled, depth_below(Lung.mesh.boundary, pulled.moving), unsmoothed)
     assert (signed_volumes(followed.map.moved, Lung.mesh.tets) > 0).all()
     assert (np.linalg.norm(followed.map(aside) - shape.map(aside), axis=1) > 3.0).all()
 

@@ -118,7 +118,7 @@ def test_the_plain_fit_is_made_of_what_was_observed(monkeypatch: pytest.MonkeyPa
     assert known.asked["fit_collapse"][2] == fit_settings(known.settings)
     assert known.asked["keep_in_range"][1] is known.plain.state
     (choice,) = known.stages.choices
-    assert (choice.part, choice.kept, choice.value, choice.limit) == ("finite strain", True, 0.01, 0.001)
+    assert (choice.part, choice.kept, choice.value, choice.limit) == ("finite strain", True, 0.01, 0.01)
 
 
 def test_keypoints_are_matched_where_the_strain_measure_that_holds_puts_them(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from poro.mesh import TetMesh, closest_points
+from poro.mesh import TetMesh
+from poro.mesh.closest import depth_below
 from registration.maps.field import DisplacementField
 from registration.maps.rigid import RigidTransform
 from registration.volume import Array, Grid, Mask
@@ -240,7 +241,7 @@ def depth_below_pleura(lung: TetMesh, points_ras: Array) -> Array:
     depth = np.full(len(points_ras), np.nan)
     known = np.isfinite(points_ras).all(axis=1)
     if known.any():
-        depth[known] = -closest_points(lung.boundary, points_ras[known]).distance
+        depth[known] = depth_below(lung.boundary, points_ras[known])
     return depth
 
 

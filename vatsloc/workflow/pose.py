@@ -10,7 +10,7 @@ import numpy as np
 from scipy import ndimage
 
 from poro.fem import Extrapolation, Tissue, extrapolate
-from poro.mesh import TetMesh, closest_points, stuff
+from poro.mesh import TetMesh, stuff
 from poro.mesh.tetmesh import signed_volumes
 from registration.ffd import FfdFit, FfdSettings, Weights
 from registration.images.resample import coarsen_mask
@@ -150,7 +150,7 @@ def change_of_pose(
                 Shape(
                     placed,
                     to_inflated,
-                    np.flatnonzero(seen & (depth_of_nodes(mesh) > DEEP_MM)),
+                    np.flatnonzero(seen & (mesh.node_depths > DEEP_MM)),
                     DEEP_MM,
                     inflated_surface(lung_inf, prepared.inflated.volume, prepared.inflated.field),
                 ),
@@ -187,7 +187,7 @@ def continued(mesh: TetMesh, placed: TetMesh, points: Array, seen: Array, settle
     nodes; seen, settled: (n,) bool, in view; inverted. The elastic lung is first laid out by the best quadratic map of
     the nodes that are believed in full, since linear elasticity loses large rotations and strains.
     """
-    depth = depth_of_nodes(mesh)
+    depth = mesh.node_depths
     deep = np.clip((depth - SHALLOW_MM) / (DEEP_MM - SHALLOW_MM), 0, 1)
     told = SHALLOW * (SEEN / SHALLOW) ** deep
     weights = np.where(seen, told, np.minimum(told, UNSEEN))
@@ -196,11 +196,6 @@ def continued(mesh: TetMesh, placed: TetMesh, points: Array, seen: Array, settle
     found = extrapolate(laid_out, nodes, (points - laid_out.points)[nodes], Tissue(), weights[nodes])
     u = laid_out.points + found.u - placed.points
     return replace(found, u=u, det_f=signed_volumes(placed.points + u, mesh.tets) / placed.volumes)
-
-
-def depth_of_nodes(mesh: TetMesh) -> Array:
-    """Depth (n,) mm of a mesh's nodes below its surface."""
-    return -closest_points(mesh.boundary, mesh.points).distance
 
 
 def _laid_out(placed: TetMesh, points: Array, believed: Array) -> Array:

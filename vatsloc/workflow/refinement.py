@@ -17,7 +17,8 @@ from scipy.spatial import cKDTree
 
 from poro.fem import Tissue, prepare_solid
 from poro.fit import PointConstraints, elastic_correction
-from poro.mesh import TetMesh, closest_points
+from poro.mesh import TetMesh
+from poro.mesh.closest import depth_below
 from poro.mesh.tetmesh import signed_volumes
 from registration.correspondences import Correspondences
 from registration.images.morphology import bounding_box, erode
@@ -138,7 +139,7 @@ def refine_by_blocks(prospect: Prospect, shape: Shape) -> BlockRefinement:
     for lungs, (voxel_mm, reach_mm) in zip(prospect.lungs, PASSES, strict=True):
         back = trial.map.inverse().linearized
         matches = match_aligned(*lungs, starts, back, AlignedSettings(reach_mm))
-        depth = _depth(shape.map.mesh, matches.moving)
+        depth = depth_below(shape.map.mesh.boundary, matches.moving)
         used = depth <= shape.within_mm
         if shape.cut is not None:
             used &= np.abs(shape.cut(matches.moving)) >= BESIDE_CUT_MM
@@ -212,12 +213,7 @@ def _within_reach(points: Array, shape: Shape) -> Array:
     if np.isinf(shape.within_mm):
         return points
     at = shape.map.inverse()(points)
-    return np.asarray(points[_depth(shape.map.mesh, at) <= shape.within_mm + PASSES[0][1]])
-
-
-def _depth(mesh: TetMesh, points: Array) -> Array:
-    """Depth (n,) mm of points below a lung's surface."""
-    return -closest_points(mesh.boundary, points).distance
+    return np.asarray(points[depth_below(shape.map.mesh.boundary, at) <= shape.within_mm + PASSES[0][1]])
 
 
 def _followed(shape: Shape, matches: Correspondences, depth: Array, smooth: Smoother) -> Shape:
@@ -242,7 +238,7 @@ def _beside_wall(shape: Shape) -> Shape:
     rest, (nodes, gap, normals) = shape.rest, _off_wall(shape)
     if len(nodes) == 0:
         return shape
-    deep = np.flatnonzero(_depth(shape.map.mesh, shape.map.mesh.points) > SHALLOW_MM)
+    deep = np.flatnonzero(shape.map.mesh.node_depths > SHALLOW_MM)
     still = np.zeros((len(deep), 3))
     wanted = PointConstraints(
         rest.points[np.concatenate([deep, nodes])],

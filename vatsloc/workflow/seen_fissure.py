@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from poro.mesh import closest_points, interpolate, locate
+from poro.mesh import interpolate, locate
+from poro.mesh.closest import depth_below
 from registration.correspondences import Correspondences
 from registration.volume import Array
 from vatsloc.imaging.surface import Border
@@ -58,7 +59,7 @@ class _Seen:
 
     def deep(self, in_ct: Array) -> Array:
         """Points (q, 3) mm of the CT that lie deep below the pleura."""
-        return in_ct[-closest_points(self.pose.mesh_ct.boundary, in_ct).distance > LEAST_DEEP_MM]
+        return in_ct[depth_below(self.pose.mesh_ct.boundary, in_ct) > LEAST_DEEP_MM]
 
 
 def seen_fissure(pose: ChangeOfPose, observed: Observed, keypoints: Correspondences) -> Fissure | None:

@@ -99,7 +99,7 @@ class LeaveOutSettings(_Table):
 
     first_registration_mm: float = Field(default=-1.0, ge=-1)
     residual_mm: float = Field(default=2.5, ge=-1)
-    strained_share: float = Field(default=0.001, ge=-1)
+    strained_share: float = Field(default=0.01, ge=-1)
     overlap_ml: float = Field(default=5.0, ge=-1)
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from poro.mesh import TetMesh, closest_points
+from poro.mesh import TetMesh
 from registration.maps.moving_least_squares import MovingLeastSquares, moving_least_squares
 from registration.volume import Array
 
@@ -39,12 +39,11 @@ def smoother(mesh: TetMesh, piece: Array, held: Array) -> Smoother:
     mesh: the lung before it moved, mm; piece: (n,) number of the piece that every node belongs to; held: (k,) nodes
     that stay where they are.
     """
-    depth = np.abs(closest_points(mesh.boundary, mesh.points).distance)
-    free = np.ones(len(depth), dtype=bool)
+    free = np.ones(len(mesh.points), dtype=bool)
     free[held] = False
     parts = []
     for number in np.unique(piece):
-        telling = np.flatnonzero((piece == number) & (depth >= TOLD_MM))
+        telling = np.flatnonzero((piece == number) & (mesh.node_depths >= TOLD_MM))
         told = np.flatnonzero((piece == number) & free)
         if len(telling) >= LEAST_NODES and len(told):
             fit = moving_least_squares(mesh.points[telling], mesh.points[told])

@@ -24,7 +24,7 @@ from vatsloc.imaging.cbct import Cupping, FieldOfView, PreparedCbct
 from vatsloc.imaging.surface import inflated_surface
 from vatsloc.maps import MeshMap
 from vatsloc.study.bench.elastix import ElastixSettings, elastix_version, run_elastix
-from vatsloc.workflow.pose import DEEP_MM, continued, depth_of_nodes, ffd_settings
+from vatsloc.workflow.pose import DEEP_MM, continued, ffd_settings
 from vatsloc.workflow.refinement import Compared, Shape, prospect, refine_by_blocks
 from vatsloc.workflow.settings import Settings
 
@@ -110,7 +110,7 @@ def change_of_state(ct: LungImage, scan: LungImage, ct_from_scan: PointMap) -> M
     shape = Shape(
         mesh,
         MeshMap(mesh, placed, RigidTransform.identity()),
-        np.flatnonzero(settled & (depth_of_nodes(mesh) > DEEP_MM)),
+        np.flatnonzero(settled & (mesh.node_depths > DEEP_MM)),
         DEEP_MM,
         inflated_surface(scan.lung, scan.volume, _all_seen(scan.volume)),
     )
