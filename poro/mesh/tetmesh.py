@@ -65,8 +65,10 @@ class TetMesh:
 
     @cached_property
     def node_depths(self) -> Array:
-        """How deep each node lies below the outer surface, (n,) mm."""
-        return depth_below(self.boundary, self.points)
+        """How deep each node lies below the outer surface, (n,) mm. None lies outside, but where surfaces of two pieces
+        coincide their sides cannot be told apart.
+        """
+        return np.abs(depth_below(self.boundary, self.points))
 
 
 @dataclass(frozen=True)
