@@ -33,9 +33,9 @@ misses the twelve nearest ones on average, PER_BLOCK_MM for every millimetre bey
 which is far where all lie to one side."""
 KEYPOINT_MM, PER_CONTRADICTION = 1.5, 2.5
 """What is added to that, as independent errors are, where such a lung misses the keypoints about it: PER_CONTRADICTION
-for every millimetre beyond KEYPOINT_MM, which they are off by themselves. One of both is wrong there. The constants make
-the smallest radius that holds 93 % of the tissue in every class of depth of each of ten phantoms outside the suite, with
-a margin (docs/method.md)."""
+for every millimetre beyond KEYPOINT_MM, which they are off by themselves. One of both is wrong there. The constants
+make the smallest radius that holds 93 % of the tissue in every class of depth of each of ten phantoms outside the
+suite, with a margin (docs/method.md)."""
 SHEET_MM, SHEET_FACTOR = 8.0, 1.4
 """How far from a cut tissue may belong to the other piece, since a bowed sheet is not where the fissure is everywhere,
 and by how much the ellipsoid reaches beyond where that went: it holds 96 % of the tissue beside the cuts of base 505
