@@ -14,7 +14,7 @@ import vatsloc.study.bench.batched_contact
 from poro.arrays import Array
 from poro.collapse import PoroStatus, Theta, assemble, solve
 from poro.contact import ChestWall, Compliance, ContactState, ContactStatus, level_set, solve_contact
-from poro.contact.active_set import Guess
+from poro.contact.active_set import ALL_PIVOTS, Guess
 from poro.contact.geometric_stiffness import Directions, geometric_stiffness
 from poro.contact.kkt import kkt_factor
 from poro.fem import Tissue, solid
@@ -83,7 +83,7 @@ def test_each_load_tells_how_it_ended_and_the_slow_ones_go_on_alone(
 
     def pivoting(*args: object) -> ContactState:
         handed.append(args[3])  # type: ignore[arg-type]
-        return solve_contact(*args, max_steps=1 if len(handed) == 1 else 30)  # type: ignore[arg-type]
+        return solve_contact(*args, most_pivots=1 if len(handed) == 1 else ALL_PIVOTS)  # type: ignore[arg-type]
 
     monkeypatch.setattr(vatsloc.study.bench.batched_contact, "QUICK_STEPS", 2)
     monkeypatch.setattr(vatsloc.study.bench.batched_contact, "solve_contact", pivoting)
