@@ -9,7 +9,7 @@ from numba import njit
 from scipy import ndimage
 
 from poro.arrays import Array
-from poro.mesh.closest import closest_points
+from poro.mesh.closest import depth_below
 from poro.mesh.trisurface import TriSurface
 
 
@@ -37,7 +37,7 @@ def level_set(surface: TriSurface, step_mm: float, smooth_mm: float) -> LevelSet
     shape = np.ceil((surface.points.max(axis=0) + MARGIN_MM - origin) / step_mm).astype(int) + 1
     axes = [origin[d] + step_mm * np.arange(shape[d]) for d in range(3)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
-    distance = -closest_points(surface, points).distance.reshape(shape)
+    distance = depth_below(surface, points).reshape(shape)
     smooth = ndimage.gaussian_filter(distance, smooth_mm / step_mm, mode="nearest") if smooth_mm else distance
     return LevelSet(ndimage.spline_filter(smooth, order=3, mode="mirror"), origin, step_mm)
 

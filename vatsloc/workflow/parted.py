@@ -2,7 +2,7 @@
 
 The lung in one piece comes first. Where keypoints and gas agree on a sheet along which it parted, both pieces are laid
 out by smooth maps of their own keypoints and corrected elastically, each for itself. That is kept if it predicts
-keypoints held out from it better than the lung in one piece does.
+keypoints held out from it better than the lung in one piece does, by the more, the weaker that evidence is.
 """
 
 from __future__ import annotations
@@ -105,7 +105,7 @@ def cut_lung(prepared: Prepared, fissure: Fissure, edge_mm: float) -> Pieces:
 def _fitted(
     prepared: Prepared, pose: ChangeOfPose, collapse: Collapse, fissure: Fissure, settings: Settings
 ) -> tuple[ChangeOfPose, Collapse] | None:
-    """The collapse in pieces, without its residual registration; None where it predicts no better."""
+    """The collapse in pieces, without its residual registration; None where it predicts too little better."""
     observed, model, found = collapse.observed, collapse.model, collapse.model.correspondences
     try:
         fine, coarse = (

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from poro.mesh import TetMesh
-from registration.images.interpolate import interpolate
-from registration.images.resample import coarsen, resample_mask
-from registration.maps.field import DisplacementField, slabs
-from registration.volume import Array, Grid, Mask, Volume
+from registration.images.resample import coarsen, resample, resample_mask
+from registration.maps.field import DisplacementField
+from registration.volume import Mask, Volume
 from vatsloc.maps import MeshMap, covered, sampled
 from vatsloc.workflow.prepare import Prepared
 
-PRIOR_SPACING_MM, OUTSIDE_HU = 3.0, -1000.0
+PRIOR_SPACING_MM = 3.0
 
 
 @dataclass(frozen=True)
@@ -39,19 +36,11 @@ def warped_pair(prepared: Prepared, lung_def: Mask, def_from_inf: MeshMap, voxel
     deflated, inflated = (coarsen(image.volume, voxel_mm) for image in (prepared.deflated, prepared.inflated))
     grid = deflated.grid
     back = sampled(def_from_inf.inverse(), grid.with_spacing(PRIOR_SPACING_MM))
-    there = np.stack([back(points) for points in slabs(grid)])  # both are asked for at the same places
-    usable = prepared.inflated.field.usable
-    both = _at(usable.inside, usable.grid, there, 0.0, grid) >= 0.5
+    both = resample_mask(prepared.inflated.field.usable, grid, back).inside
     both &= resample_mask(prepared.deflated.field.usable, grid).inside
     moved = TetMesh(def_from_inf.moved, def_from_inf.mesh.tets)
     seen, lung, modelled = (
         Mask(inside & both, grid.ras_from_ijk)
         for inside in (both, resample_mask(lung_def, grid).inside, covered(moved, grid).inside)
     )
-    warped = Volume(_at(inflated.hu, inflated.grid, there, OUTSIDE_HU, grid), grid.ras_from_ijk)
-    return WarpedPair(deflated, warped, seen, lung, modelled, back)
-
-
-def _at(voxels: Array, source: Grid, there: Array, fill: float, grid: Grid) -> Array:
-    """An image's voxels on a grid, whose slabs lie at points (ni, nj nk, 3) of it."""
-    return interpolate(voxels.astype(np.float32, copy=False), source, there.reshape(-1, 3), fill).reshape(grid.shape)
+    return WarpedPair(deflated, resample(inflated, grid, back), seen, lung, modelled, back)
