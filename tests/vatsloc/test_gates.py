@@ -9,12 +9,18 @@ import pytest
 from numpy.testing import assert_allclose
 
 from poro.mesh import TetMesh
-from registration.volume import Mask
+from registration.volume import Array, Mask
 from tests.vatsloc import run_scene as known
 from vatsloc.imaging.surface import Border
 from vatsloc.workflow.gates import Gate
 from vatsloc.workflow.model_selection import Refinement
-from vatsloc.workflow.quality import in_view, quality_gates, surface_distances, surface_percentiles
+from vatsloc.workflow.quality import (
+    in_view,
+    quality_gates,
+    surface_distances,
+    surface_percentiles,
+    warn_of_unsure_tissue,
+)
 from vatsloc.workflow.settings import GateSettings
 from vatsloc.workflow.stages import Stages
 
@@ -204,3 +210,27 @@ def test_of_two_views_the_worse_counts_and_both_are_warned_of() -> None:
     log = Stages()
     gate = in_view({"inflated": (point, np.zeros(3)), "deflated": (point, np.zeros(3))}, 0.0, log)
     assert (gate.ok, gate.value, log.warnings) == (True, 0.0, [])
+
+
+def unsure(mesh: TetMesh, seen: Array, radius_mm: Array) -> list[str]:
+    """The warnings for a lung whose nodes are known to `radius_mm`."""
+    stages = Stages()
+    warn_of_unsure_tissue(mesh, seen, radius_mm, stages)
+    return stages.warnings
+
+
+def test_tissue_near_the_pleura_that_is_badly_known_is_told():
+    mesh = known.ball_mesh(np.zeros(3), 40.0, 10.0)
+    near, east = mesh.node_depths <= 10, mesh.points[:, 0]
+    order = np.argsort(-east)
+    share = np.cumsum(np.where(near, mesh.node_volumes, 0)[order]) / mesh.node_volumes[near].sum()
+    cap = {part: east >= east[order[np.searchsorted(share, part)]] for part in (0.2, 0.35)}
+    everywhere = np.ones(len(east), dtype=bool)
+
+    (warning,) = unsure(mesh, everywhere, np.where(cap[0.35], 17.2, 3.0))
+    assert "more than 17 mm" in warning
+    assert not unsure(mesh, everywhere, np.where(cap[0.2], 17.2, 3.0)), "less than a quarter"
+    assert not unsure(mesh, everywhere, np.where(cap[0.35], 11.5, 3.0)), "known well enough"
+    assert not unsure(mesh, ~cap[0.35], np.where(cap[0.35], 17.2, 3.0)), "out of view"
+    assert not unsure(mesh, everywhere, np.where(near, 3.0, 99.0)), "deeper than any that cannot be felt"
+    assert not unsure(mesh, ~everywhere, np.full(len(east), 99.0)), "none in view"

@@ -23,6 +23,7 @@ from vatsloc.workflow.model_selection import Refinement
 from vatsloc.workflow.run import _in_deflated, _in_inflated, _nodule_mask, _pictures, _record, _residuals, _result
 from vatsloc.workflow.settings import Settings, settings_of
 from vatsloc.workflow.stages import Stages
+from vatsloc.workflow.uncertainty import radius95
 
 AXES = np.array([[0.6, 0.8, 0], [0, 0, 1.0], [0.8, -0.6, 0]])
 ELLIPSOID_MM = np.array([6.0, 5.0, 4.0])
@@ -38,7 +39,8 @@ def localization(scene: known.Scene) -> Localization:
 
 @pytest.fixture(scope="module")
 def found() -> Localization:
-    return localization(known.scene())
+    scene = known.scene()
+    return replace(localization(scene), radius95_mm=radius95(scene.pose, scene.collapse))
 
 
 @pytest.fixture(scope="module")

@@ -17,10 +17,10 @@ from vatsloc.workflow.gates import Gate
 from vatsloc.workflow.pneumothorax import Collapse
 from vatsloc.workflow.pose import ChangeOfPose
 from vatsloc.workflow.prepare import Prepared
-from vatsloc.workflow.quality import ellipsoid_gate, in_view, quality_gates, warn_of_doubts
+from vatsloc.workflow.quality import ellipsoid_gate, in_view, quality_gates, warn_of_doubts, warn_of_unsure_tissue
 from vatsloc.workflow.settings import Settings
 from vatsloc.workflow.stages import Stages
-from vatsloc.workflow.uncertainty import covariance
+from vatsloc.workflow.uncertainty import covariance, radius95
 
 
 @dataclass(frozen=True)
@@ -28,8 +28,8 @@ class Localization:
     """Where the nodule is, and everything that says why.
 
     nodule_inf, nodule_def: (3,) RAS mm in the cone-beam CTs; ellipsoid_mm: (3,) semi-axes that hold it with 95 %,
-    longest first; ellipsoid_axes: (3, 3), their directions in rows; checks: what the run's check of itself found, None
-    before it.
+    longest first; ellipsoid_axes: (3, 3), their directions in rows; checks: what the run's check of itself found;
+    radius95_mm: (n,) of the lung's nodes, that hold where their tissue is with 95 %; both None before the check.
     """
 
     prepared: Prepared
@@ -41,6 +41,7 @@ class Localization:
     ellipsoid_axes: Array
     gates: dict[str, Gate]
     checks: Checks | None = None
+    radius95_mm: Array | None = None
 
     @property
     def def_from_inf(self) -> MeshMap:
@@ -98,4 +99,8 @@ def checked(
             **check_gates(checks, settings.gates),
             "ellipsoid": ellipsoid_gate(lengths, settings.gates),
         }
-        return replace(found, ellipsoid_mm=lengths, ellipsoid_axes=axes, gates=gates, checks=checks)
+        radius = radius95(pose, collapse, checks.chain)
+        warn_of_unsure_tissue(pose.mesh_ct, prepared.deflated.field.usable.holds(collapse.points_after), radius, stages)
+        return replace(
+            found, ellipsoid_mm=lengths, ellipsoid_axes=axes, gates=gates, checks=checks, radius95_mm=radius
+        )

@@ -48,7 +48,7 @@ from vatsloc.workflow.residual import Residual
 from vatsloc.workflow.settings import Settings
 from vatsloc.workflow.stages import DEFLATED, INFLATED, Say, Stages, quiet
 from vatsloc.workflow.state import State, read_state
-from vatsloc.workflow.uncertainty import radius95, scatter
+from vatsloc.workflow.uncertainty import scatter
 
 WARP, PAGE = "warp", "report"
 FIELD_MARGIN_MM = 10.0
@@ -172,9 +172,9 @@ def _tetra(mesh: TetMesh, displacement: Array, pressure: Array, det_f: Array, co
 
 
 def _with_radius95(found: Localization, lung: TetraMesh) -> TetraMesh:
-    """With the 95 % radius of each node's position."""
-    radius = radius95(found.pose, found.collapse, None if found.checks is None else found.checks.chain)
-    return replace(lung, point_data={**lung.point_data, RADIUS95: radius})
+    """With the 95 % radius of each node's position, where it is known."""
+    radius = found.radius95_mm
+    return lung if radius is None else replace(lung, point_data={**lung.point_data, RADIUS95: radius})
 
 
 def _nodule_mask(case: Case, found: Localization) -> Mask:
