@@ -12,7 +12,7 @@ from poro.arrays import Array
 from poro.fem.forms import KEPT_MESHES, stiffness
 from poro.fem.tissue import Tissue
 from poro.linalg.dissection import Tree
-from poro.linalg.solver import LinearSolver, elimination_tree, linear_solver, solve_once
+from poro.linalg.solver import ONCE_TOLERANCE, LinearSolver, elimination_tree, linear_solver, solver_for_few
 from poro.mesh.tetmesh import TetMesh
 
 
@@ -69,14 +69,14 @@ def solid(mesh: TetMesh, tissue: Tissue, fixed: Array, constraints: csr_matrix |
 def continued(mesh: TetMesh, tissue: Tissue, fixed: Array, imposed: Array) -> Array:
     """Displacements (n, 3) mm of a body of which nodes `fixed` (k,), in ascending order, are moved by (k, 3) mm.
 
-    As of `solid` and its `solve`, for less where that is asked for once, to the tolerance of `solve_once`. Raises as
-    `solid`.
+    As of `solid` and its `solve`, for less where that is asked for once, to the tolerance of `solver_for_few`. Raises
+    as `solid`.
     """
     _require_held(mesh, fixed)
     free, matrix, coupling = _parted(stiffness(mesh, tissue.lame_kpa, tissue.shear_kpa), fixed)
     u = np.empty_like(mesh.points)
     u[fixed] = imposed
-    u[free] = solve_once(matrix, mesh.points[free], -(coupling @ imposed.ravel())).reshape(-1, 3)
+    u[free] = solver_for_few(matrix, mesh.points[free]).solve(-(coupling @ imposed.ravel())).reshape(-1, 3)
     return u
 
 
@@ -95,12 +95,15 @@ def _parted(matrix: csr_matrix, fixed: Array) -> tuple[Array, csr_matrix, csr_ma
     return free, reduced[:, rows].tocsr(), reduced[:, unknowns_of(fixed)].tocsr()
 
 
-def constrained(mesh: TetMesh, tissue: Tissue, constraints: csr_matrix, force: Array) -> Array:
-    """Displacements (n, 3) mm under nodal forces (n, 3) kPa mm2 of a body that point constraints (3n, 3n) kPa mm alone
-    hold. Raises SolverError when they do not suffice.
+def constrained(
+    mesh: TetMesh, tissue: Tissue, constraints: csr_matrix, tolerance: float = ONCE_TOLERANCE
+) -> LinearSolver:
+    """Solver for the displacements (3n,) mm of a body that point constraints (3n, 3n) kPa mm alone hold, under nodal
+    forces (3n,) kPa mm2; for few of them, to a tolerance as of `solver_for_few`. It raises SolverError when the
+    constraints do not suffice.
     """
     matrix = (stiffness(mesh, tissue.lame_kpa, tissue.shear_kpa) + constraints).tocsr()
-    return solve_once(matrix, mesh.points, force.ravel(), _tree(mesh, tissue)).reshape(-1, 3)
+    return solver_for_few(matrix, mesh.points, _tree(mesh, tissue), tolerance)
 
 
 def anchor(mesh: TetMesh, tissue: Tissue) -> Array:

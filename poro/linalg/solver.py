@@ -173,18 +173,45 @@ def multigrid(matrix: csr_matrix, points: Array, tolerance: float = 1e-10) -> Mu
     return Multigrid(blocked, hierarchy, inverses, tolerance)
 
 
-def solve_once(matrix: csr_matrix, points: Array, right: Array, tree: Tree | None = None) -> Array:
-    """Solution of one right-hand side (n,), to a relative residual of ONCE_TOLERANCE; matrix and tree as of
-    `linear_solver`.
+@dataclass(frozen=True)
+class ForFew:
+    """Solver of a matrix as of `linear_solver`, in less time than that takes for one right-hand side or a few.
+
+    quick: None where the matrix is too ill-conditioned for it, or proves to be.
+    """
+
+    matrix: csr_matrix
+    points: Array
+    tree: Tree
+    quick: LinearSolver | None
+
+    def solve(self, right: Array) -> Array:
+        """Solution of the shape of `right`."""
+        if self.quick is not None:
+            try:
+                return self.quick.solve(right)
+            except SolverError:
+                pass
+        return linear_solver(self.matrix, self.points, self.tree).solve(right)
+
+
+def solver_for_few(
+    matrix: csr_matrix, points: Array, tree: Tree | None = None, tolerance: float = ONCE_TOLERANCE
+) -> ForFew:
+    """Solver of a symmetric positive definite matrix for few right-hand sides, to a relative residual of `tolerance`
+    where that is multigrid's; matrix and tree as of `linear_solver`.
     """
     block = matrix.shape[0] // len(points)
     tree = tree or elimination_tree(matrix, points)
+    quick: LinearSolver | None
     try:
         if tree.factor_entries(block) > ONCE_LIMIT:
-            return multigrid(matrix, points, ONCE_TOLERANCE).solve(right)
-        return SingleFactor(matrix, cholesky(matrix, tree, block, np.float32)).solve(right)
-    except SolverError:  # too ill-conditioned for either
-        return linear_solver(matrix, points, tree).solve(right)
+            quick = multigrid(matrix, points, tolerance)
+        else:
+            quick = SingleFactor(matrix, cholesky(matrix, tree, block, np.float32))
+    except SolverError:
+        quick = None
+    return ForFew(matrix, points, tree, quick)
 
 
 BATCH = 384

@@ -48,6 +48,39 @@ def _affine_values(voxels, affine, fill, out, start, stop):
             _values(voxels, points, fill, out[p, q], 0, out.shape[2])
 
 
+class _Moved(NamedTuple):
+    """Where a voxel of a grid lies once a field (mi, mj, mk, 3) mm has moved it. at_field, at_image: (3, 4) from the
+    grid's voxels to the field's and to an image's; per_mm: (3, 3) voxels of the image per mm.
+    """
+
+    vectors: Array
+    at_field: Array
+    at_image: Array
+    per_mm: Array
+
+
+@njit(cache=True, nogil=True)
+def _moved_values(voxels, moved, fill, out, start, stop):
+    vectors, at_field, at_image, per_mm = moved
+    mi, mj, mk, _ = vectors.shape
+    points = np.empty((out.shape[2], 3))
+    for p in range(start, stop):
+        for q in range(out.shape[1]):
+            for r in range(out.shape[2]):
+                x = at_field[0, 0] * p + at_field[0, 1] * q + at_field[0, 2] * r + at_field[0, 3]
+                y = at_field[1, 0] * p + at_field[1, 1] * q + at_field[1, 2] * r + at_field[1, 3]
+                z = at_field[2, 0] * p + at_field[2, 1] * q + at_field[2, 2] * r + at_field[2, 3]
+                x, y, z = min(max(x, 0.0), mi - 1.0), min(max(y, 0.0), mj - 1.0), min(max(z, 0.0), mk - 1.0)
+                i, j, k = lower(x, mi), lower(y, mj), lower(z, mk)
+                u0 = value(vectors[:, :, :, 0], i, j, k, x - i, y - j, z - k)
+                u1 = value(vectors[:, :, :, 1], i, j, k, x - i, y - j, z - k)
+                u2 = value(vectors[:, :, :, 2], i, j, k, x - i, y - j, z - k)
+                for m in range(3):
+                    first = at_image[m, 0] * p + at_image[m, 1] * q + at_image[m, 2] * r + at_image[m, 3]
+                    points[r, m] = first + per_mm[m, 0] * u0 + per_mm[m, 1] * u1 + per_mm[m, 2] * u2
+            _values(voxels, points, fill, out[p, q], 0, out.shape[2])
+
+
 @njit(cache=True, nogil=True)
 def _warp(voxels, base, displacement, index, ijk_from_ras, out, start, stop):
     ni, nj, nk = voxels.shape
@@ -103,4 +136,22 @@ def interpolate_affine(voxels: Array, ijk_from_voxel: Array, shape: tuple[int, i
     in_parts(
         partial(_affine_values, _checked(voxels), np.ascontiguousarray(ijk_from_voxel), np.float32(fill), out), shape[0]
     )
+    return out
+
+
+def interpolate_moved(voxels: Array, grid: Grid, target: Grid, field: tuple[Array, Grid], fill: float) -> Array:
+    """Values of voxels (ni, nj, nk) of a grid at those of another one, each moved by the vectors (mi, mj, mk, 3) mm of
+    a field on a third one, trilinear; beyond the field its nearest vector holds, beyond the image `fill`.
+    """
+    vectors, lattice = field
+    if 1 in lattice.shape:  # a cell has two voxels along every axis
+        vectors = np.pad(vectors, [(0, int(n == 1)) for n in vectors.shape], mode="edge")
+    moved = _Moved(
+        np.ascontiguousarray(vectors),
+        lattice.ijk_from_ras[:3] @ target.ras_from_ijk,
+        grid.ijk_from_ras[:3] @ target.ras_from_ijk,
+        np.ascontiguousarray(grid.ijk_from_ras[:3, :3]),
+    )
+    out = np.empty(target.shape, dtype=np.float32)
+    in_parts(partial(_moved_values, _checked(voxels), moved, np.float32(fill), out), target.shape[0])
     return out

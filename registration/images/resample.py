@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from registration.images.interpolate import EDGE, interpolate, interpolate_affine
+from registration.images.interpolate import EDGE, interpolate, interpolate_affine, interpolate_moved
 from registration.kernels.banded import Banded, along_axes
 from registration.maps.field import DisplacementField, PointMap, slabs
 from registration.maps.rigid import RigidTransform
@@ -69,14 +69,11 @@ def _sampled(voxels: Array, source: Grid, target: Grid, mapping: PointMap | None
         if _is_diagonal(ijk_from_target[:3, :3], target.shape):
             return _along_axes(voxels, np.diag(ijk_from_target), ijk_from_target[:3, 3], target.shape, fill)
         return interpolate_affine(voxels, ijk_from_target, target.shape, fill)
-    if isinstance(mapping, DisplacementField) and mapping.grid.same_as(target):
-        displacement = mapping.vectors
-        points = (p + displacement[i].reshape(-1, 3) for i, p in enumerate(slabs(target)))
-    else:
-        points = (mapping(p) for p in slabs(target))
+    if isinstance(mapping, DisplacementField):
+        return interpolate_moved(voxels, source, target, (mapping.vectors, mapping.grid), fill)
     out = np.empty(target.shape, dtype=np.float32)
-    for i, slab in enumerate(points):
-        out[i] = interpolate(voxels, source, slab, fill).reshape(target.shape[1:])
+    for i, points in enumerate(slabs(target)):
+        out[i] = interpolate(voxels, source, mapping(points), fill).reshape(target.shape[1:])
     return out
 
 

@@ -8,7 +8,7 @@ from shapes import box, ellipsoid
 
 from poro.fem import Tissue
 from poro.fit import FitSettings, Target, constraints_to, elastic_correction
-from poro.fit.elastic_correction import PointConstraints
+from poro.fit.elastic_correction import PointConstraints, elastic_pull
 from poro.mesh import interpolate, locate
 
 TISSUE = Tissue()
@@ -94,3 +94,19 @@ def test_which_surface_points_count_is_not_left_to_rounding() -> None:
         u = 1e-9 * rng.normal(size=mesh.points.shape)
         chosen.add(len(constraints_to(target, mesh, u, FitSettings()).points))
     assert chosen == {60}
+
+
+def test_a_pull_follows_other_offsets_at_the_same_points_as_the_first_round_of_a_correction_does() -> None:
+    mesh, rng = ellipsoid(10.0), np.random.default_rng(6)
+    s = mesh.boundary
+    points = np.concatenate([rng.uniform(-25, 25, (40, 3)), s.points[:30]])
+    normals = np.concatenate([np.zeros((40, 3)), s.node_normals[:30]])
+    sigma = rng.uniform(0.5, 3.0, 70)
+    first, second = (rng.normal(0, 2, (70, 3)) for _ in range(2))
+    pull = elastic_pull(mesh, TISSUE, PointConstraints(points, first, sigma, normals), 0.02)
+    for offset in (first, second):
+        alone = PointConstraints(points, offset, sigma, normals)
+        exact = elastic_correction(mesh, np.zeros_like(mesh.points), TISSUE, alone, 0.02, rounds=1).u
+        assert np.abs(exact).max() > 0.5
+        assert_allclose(pull(offset), exact, rtol=0, atol=1e-9)
+    assert_allclose(pull.operator @ mesh.points, interpolate(locate(mesh, points), mesh.points), atol=1e-9)

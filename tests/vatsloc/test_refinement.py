@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from poro.fit import PointConstraints
 from poro.mesh.closest import depth_below
 from poro.mesh.tetmesh import TetMesh, signed_volumes
 from registration.correspondences import Correspondences
@@ -59,7 +58,8 @@ def test_the_lung_follows_blocks_up_to_the_pleura() -> None:
     assert before[shallow].mean() > 1.8
     assert after[shallow].mean() < 0.65 * before[shallow].mean()
     assert after[~shallow].mean() < 0.45
-    assert [one.voxel_mm for one in found.passes] == [1.5, 1.5, 1.0]
+    assert [one.voxel_mm for one in found.passes] == [1.5, 1.0]
+    assert found.passes[0].settled
     first = found.passes[0]
     assert first.kept
     assert first.after_mm < first.before_mm
@@ -190,6 +190,32 @@ def test_a_pass_is_followed_that_leaves_hardly_more_at_held_out_blocks(
     assert (found.points == Lung.start).all() != kept
 
 
+@pytest.mark.parametrize(("misfit", "voxels"), [(0.6, [1.5, 1.0]), (0.7, [1.5, 1.5, 1.0])])
+def test_the_same_voxels_serve_once_more_where_held_out_blocks_are_still_missed(
+    misfit: float, voxels: list[float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "_misfit", lambda *_given: misfit)
+    found = refine_by_blocks(prospect(compared(), Lung.rest, ON), Lung.shape(np.zeros(0, int)))
+    assert [one.voxel_mm for one in found.passes] == voxels
+
+
+def test_what_blocks_tell_comes_nearer_to_where_there_are_none_round_by_round(monkeypatch: pytest.MonkeyPatch) -> None:
+    points = np.random.default_rng(5).uniform(-24, 24, (500, 3))
+    points = scene.CENTRE_CT + points[np.linalg.norm(points, axis=1) < scene.RADIUS_MM - 12.0]
+    at = MeshMap(Lung.mesh, Lung.truth, AROUND)(points)
+    shape = Lung.shape(np.zeros(0, int))
+    smooth, rim = module._smoother(shape), Lung.depth < 6.0
+    errors = []
+    for rounds in (1, 2, 4):
+        monkeypatch.setattr(module, "ROUNDS", rounds)
+        depth = depth_below(Lung.mesh.boundary, points)
+        moved = module._followed(shape, Correspondences.of(at, points), depth, smooth).map.moved
+        errors.append(Lung.error(moved)[rim].mean())
+    assert errors[0] < Lung.error(Lung.start)[rim].mean()
+    assert errors[1] < 0.95 * errors[0]
+    assert errors[2] < 0.95 * errors[1]
+
+
 @pytest.mark.parametrize("lost", ["lung", "lung_ct"])
 def test_where_too_few_blocks_are_found_nothing_moves(lost: str) -> None:
     mask = {"lung": scene.lung_deflated(), "lung_ct": scene.prepared().lung_ct}[lost]
@@ -226,10 +252,9 @@ def test_no_element_is_turned_over_by_blocks_that_would_turn_it(pulls: int) -> N
 def test_no_element_is_turned_over_by_smoothing() -> None:
     """Nodes scattered by what is meant to smooth them."""
     shape = Shape(Lung.rest, MeshMap(Lung.mesh, Lung.truth, AROUND), np.zeros(0, int))
-    still = PointConstraints(Lung.rest.points[:20], np.zeros((20, 3)), np.ones(20), np.zeros((20, 3)))
     scatter = np.random.default_rng(3).normal(0, 6.0, Lung.truth.shape)
     turned = signed_volumes(Lung.truth + scatter, Lung.mesh.tets) <= 0
-    found = module._pulled(shape, still, lambda points: points + scatter).map.moved
+    found = module._unturned(shape, Lung.truth + scatter).map.moved
     assert turned.any()
     assert (signed_volumes(found, Lung.mesh.tets) > 0).all()
     assert np.linalg.norm(found - Lung.truth, axis=1).max() > 2.0

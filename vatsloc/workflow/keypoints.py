@@ -7,6 +7,7 @@ images; those that move in large groups count, and once more about a lung that f
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -17,6 +18,7 @@ from poro.mesh import TetMesh, interpolate, locate
 from registration.correspondences import Correspondences
 from registration.images.morphology import dilate, erode
 from registration.images.resample import coarsen, resample_mask
+from registration.kernels.threads import ahead
 from registration.keypoints.groups import GroupSettings, in_groups
 from registration.keypoints.matching import MatchSettings, match_keypoints
 from registration.keypoints.propagation import PropagationSettings, propagate_matches
@@ -107,9 +109,9 @@ def _looked_for_widely(
     mesh = observed.model_mesh
     found, laid_out = Correspondences.none(), [displacement, *_others(mesh.points, displacement)]
     for _ in range(ROUNDS):
-        first = found
-        for one in laid_out:
-            first = first.joined(_near_model(prepared, observed, one, seeds))
+        half = len(laid_out) // 2
+        others = ahead(partial(_near_models, prepared, observed, laid_out[half:], seeds))
+        first = found.joined(_near_models(prepared, observed, laid_out[:half], seeds)).joined(others())
         again = _moving_in_groups((regions, everywhere), _consistent(first), seeds)
         if len(again) < MORE * len(found) or not len(again):
             break
@@ -191,6 +193,16 @@ def _near_model(prepared: Prepared, observed: Observed, displacement: Array, mat
     scans = warped_pair(prepared, observed.found.lung, model, match.voxel_mm)
     found = match_keypoints(scans.deflated, scans.warped, scans.lung, match, moving_region=scans.modelled)
     return found.mapped(moving=lambda points: rigid(model.inverse()(points)))
+
+
+def _near_models(
+    prepared: Prepared, observed: Observed, displacements: list[Array], match: MatchSettings
+) -> Correspondences:
+    """What `_near_model` finds about each of several displacements."""
+    found = Correspondences.none()
+    for displacement in displacements:
+        found = found.joined(_near_model(prepared, observed, displacement, match))
+    return found
 
 
 def _inner(lung: Mask, seen: Array) -> Mask:

@@ -101,6 +101,4 @@ def checked(
         }
         radius = radius95(pose, collapse, checks.chain)
         warn_of_unsure_tissue(pose.mesh_ct, prepared.deflated.field.usable.holds(collapse.points_after), radius, stages)
-        return replace(
-            found, ellipsoid_mm=lengths, ellipsoid_axes=axes, gates=gates, checks=checks, radius95_mm=radius
-        )
+        return replace(found, ellipsoid_mm=lengths, ellipsoid_axes=axes, gates=gates, checks=checks, radius95_mm=radius)

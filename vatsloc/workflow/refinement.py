@@ -16,7 +16,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from poro.fem import Tissue, prepare_solid
-from poro.fit import PointConstraints, elastic_correction
+from poro.fit import PointConstraints
+from poro.fit.elastic_correction import elastic_pull
 from poro.mesh import TetMesh
 from poro.mesh.closest import depth_below
 from poro.mesh.tetmesh import signed_volumes
@@ -36,6 +37,8 @@ from vatsloc.workflow.smoothed import Smoother, smoother
 
 PASSES = ((1.5, 6.0), (1.5, 6.0), (1.0, 3.0))
 """Voxels of the blocks and how far they are looked for, mm, pass by pass: more are found where the first ones led."""
+SETTLED_MM = 0.65
+"""Median misfit at held-out blocks below which voxels of one size do not serve for another pass."""
 NO_WORSE = 1.02
 """A pass is followed that leaves at most this much more of the misfit at held-out blocks. They judge a lung that
 followed only three quarters of what the answer follows."""
@@ -51,6 +54,9 @@ SHALLOW_MM, DEEP_MM = 8.0, 20.0
 WALL_SIGMA_MM, WALL_REACH_MM, WALL_ALONG = 2.0, 5.0, 0.7
 """Standard deviation of where a lung that fills its cavity touches the wall; how far a node of its surface may be off,
 and the least cosine between both normals: beyond, the nearest wall is likelier another one."""
+ROUNDS = 4
+"""How often a lung is drawn to the same blocks and smoothed: where there are none, what others tell comes nearer by a
+little each time."""
 ANCHOR_SIGMA_MM = 0.2
 """Standard deviation of nodes that other evidence has placed."""
 HALVINGS = 20
@@ -114,6 +120,11 @@ class Pass:
     after_mm: float
     kept: bool
 
+    @property
+    def settled(self) -> bool:
+        """Whether the lung followed, to all that voxels of this size tell."""
+        return self.kept and self.after_mm < SETTLED_MM
+
 
 @dataclass(frozen=True)
 class BlockRefinement:
@@ -137,6 +148,8 @@ def refine_by_blocks(prospect: Prospect, shape: Shape) -> BlockRefinement:
     passes: list[Pass] = []
     trial, answer = shape, None
     for lungs, (voxel_mm, reach_mm) in zip(prospect.lungs, PASSES, strict=True):
+        if passes and passes[-1].settled and passes[-1].voxel_mm == voxel_mm:
+            continue
         back = trial.map.inverse().linearized
         matches = match_aligned(*lungs, starts, back, AlignedSettings(reach_mm))
         depth = depth_below(shape.map.mesh.boundary, matches.moving)
@@ -148,7 +161,7 @@ def refine_by_blocks(prospect: Prospect, shape: Shape) -> BlockRefinement:
             break
         hidden = held_out(matches.fixed, APART_MM)
         whole: Callable[[], Shape] = partial(_followed, trial, matches, depth, smooth())
-        if len(passes) == len(PASSES) - 1:
+        if (voxel_mm, reach_mm) == PASSES[-1]:
             whole = ahead(whole)
         tested, followed = matches.only(hidden), _followed(trial, matches.only(~hidden), depth[~hidden], smooth())
         before, after = _misfit(trial, tested), _misfit(followed, tested)
@@ -217,20 +230,23 @@ def _within_reach(points: Array, shape: Shape) -> Array:
 
 
 def _followed(shape: Shape, matches: Correspondences, depth: Array, smooth: Smoother) -> Shape:
-    """The lung after it followed matches at depth (n,) mm below the pleura, was smoothed, and followed its wall."""
+    """The lung after it followed matches at depth (n,) mm below the pleura, was smoothed, round after round, and
+    followed its wall.
+    """
     anchors, rest = shape.anchors, shape.rest
     at = MeshMap(shape.map.mesh, rest.points, shape.map.around)(matches.moving)
-    followed = _pulled(
-        shape,
-        PointConstraints(
-            np.concatenate([at, rest.points[anchors]]),
-            np.concatenate([matches.fixed - shape.map(matches.moving), np.zeros((len(anchors), 3))]),
-            np.concatenate([np.interp(depth, (SHALLOW_MM, DEEP_MM), SIGMA_MM), np.full(len(anchors), ANCHOR_SIGMA_MM)]),
-            np.zeros((len(at) + len(anchors), 3)),
-        ),
-        smooth,
+    wanted = PointConstraints(
+        np.concatenate([at, rest.points[anchors]]),
+        np.concatenate([matches.fixed - shape.map(matches.moving), np.zeros((len(anchors), 3))]),
+        np.concatenate([np.interp(depth, (SHALLOW_MM, DEEP_MM), SIGMA_MM), np.full(len(anchors), ANCHOR_SIGMA_MM)]),
+        np.zeros((len(at) + len(anchors), 3)),
     )
-    return _beside_wall(followed)
+    pull, left = elastic_pull(rest, Tissue(), wanted, STRAIN), wanted.offset
+    for _ in range(ROUNDS):
+        before = shape.map.moved
+        shape = _unturned(shape, smooth(before + pull(left)))
+        left = left - pull.operator @ (shape.map.moved - before)
+    return _beside_wall(shape)
 
 
 def _beside_wall(shape: Shape) -> Shape:
@@ -246,16 +262,13 @@ def _beside_wall(shape: Shape) -> Shape:
         np.concatenate([np.full(len(deep), ANCHOR_SIGMA_MM), np.full(len(nodes), WALL_SIGMA_MM)]),
         np.concatenate([still, normals]),
     )
-    return _pulled(shape, wanted)
+    return _unturned(shape, shape.map.moved + elastic_pull(rest, Tissue(), wanted, STRAIN)(wanted.offset))
 
 
-def _pulled(shape: Shape, wanted: PointConstraints, smooth: Callable[[Array], Array] | None = None) -> Shape:
-    """The lung after it gave way to constraints elastically, and was smoothed; no element is turned over."""
-    rest, now = shape.rest, shape.map.moved
-    after = now + elastic_correction(rest, now - rest.points, Tissue(), wanted, model_sigma=STRAIN, rounds=1).u
-    if smooth is not None:
-        after = smooth(after)
-    return shape.moved(now + unfolded(now, after - now, rest.tets))
+def _unturned(shape: Shape, points: Array) -> Shape:
+    """The lung with its nodes at points (n, 3) mm, or as near to them as turns no element over."""
+    now = shape.map.moved
+    return shape.moved(now + unfolded(now, points - now, shape.rest.tets))
 
 
 def _off_wall(shape: Shape) -> tuple[Array, Array, Array]:
