@@ -90,4 +90,4 @@ def _continue(mesh: TetMesh, nodes: Array, displacement: Array, tissue: Tissue, 
     k = len(nodes)
     operator = coo_matrix((np.ones(k), (np.arange(k), nodes)), shape=(k, len(mesh.points))).tocsr()
     matrix, force = point_constraints(operator, stiffness, displacement)
-    return constrained(mesh, tissue, matrix).solve(force.ravel()).reshape(-1, 3)
+    return constrained(mesh, tissue, matrix).solve(force)

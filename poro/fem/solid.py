@@ -95,15 +95,25 @@ def _parted(matrix: csr_matrix, fixed: Array) -> tuple[Array, csr_matrix, csr_ma
     return free, reduced[:, rows].tocsr(), reduced[:, unknowns_of(fixed)].tocsr()
 
 
+@dataclass(frozen=True)
+class Constrained:
+    """A body that point constraints alone hold, ready for nodal forces."""
+
+    solver: LinearSolver
+
+    def solve(self, force: Array) -> Array:
+        """Displacements (n, 3) mm under nodal forces (n, 3) kPa mm2. Raises SolverError when the constraints do not
+        suffice.
+        """
+        return self.solver.solve(force.ravel()).reshape(-1, 3)
+
+
 def constrained(
     mesh: TetMesh, tissue: Tissue, constraints: csr_matrix, tolerance: float = ONCE_TOLERANCE
-) -> LinearSolver:
-    """Solver for the displacements (3n,) mm of a body that point constraints (3n, 3n) kPa mm alone hold, under nodal
-    forces (3n,) kPa mm2; for few of them, to a tolerance as of `solver_for_few`. It raises SolverError when the
-    constraints do not suffice.
-    """
+) -> Constrained:
+    """A body held by point constraints (3n, 3n) kPa mm, for few forces, to a tolerance as of `solver_for_few`."""
     matrix = (stiffness(mesh, tissue.lame_kpa, tissue.shear_kpa) + constraints).tocsr()
-    return solver_for_few(matrix, mesh.points, _tree(mesh, tissue), tolerance)
+    return Constrained(solver_for_few(matrix, mesh.points, _tree(mesh, tissue), tolerance))
 
 
 def anchor(mesh: TetMesh, tissue: Tissue) -> Array:

@@ -16,19 +16,18 @@ from scipy.sparse import csr_matrix, diags
 from poro.arrays import Array
 from poro.fem.constraints import interpolation_matrix, point_constraints
 from poro.fem.forms import deformation_gradient
-from poro.fem.solid import anchor, constrained
+from poro.fem.solid import Constrained, anchor, constrained
 from poro.fem.tissue import Tissue
 from poro.fit.observations import Target, facing, independence
 from poro.fit.problem import FitSettings
-from poro.linalg.solver import ONCE_TOLERANCE, LinearSolver
 from poro.mesh.closest import closest_points
 from poro.mesh.locate import Location, locate
 from poro.mesh.tetmesh import TetMesh
 
 REGION_MM3 = 1e5
 REACH_MM = 20.0
-PULL_TOLERANCE = 1e-5
-"""Of the residual: fields of 3 mm were right to 0.002 mm on a twin's blocks, which scatter by half a millimetre."""
+CORRECTION_TOLERANCE, PULL_TOLERANCE = 1e-7, 1e-5
+"""Of the residual; with the second, fields of 3 mm were right to 0.002 mm on blocks, which scatter by half a millimetre."""
 KEYPOINT_SHARE = 0.75
 """Of a keypoint's standard deviation in the fit: that holds what few parameters cannot follow too, which the correction
 can. Chosen (1.5 mm beside 2 mm), not derived."""
@@ -117,7 +116,8 @@ def loosened(
     influence = _near(where)
     for number in count():
         unit = energy_per_datum(tissue, stiffest * 2.0**number)
-        field = _pull(mesh, tissue, operator, _penalty(shape, unit * influence / wanted.sigma_mm**2))(wanted.offset)
+        penalty = _penalty(shape, unit * influence / wanted.sigma_mm**2)
+        field = _pull(mesh, tissue, operator, penalty, CORRECTION_TOLERANCE)(wanted.offset)
         misfit = np.linalg.norm(np.einsum("qij,qj->qi", shape, wanted.offset - operator @ field), axis=1)
         scale = robust * np.maximum(wanted.sigma_mm, 1.4826 * np.median(misfit[influence > 0]))
         influence = _near(where) / (1 + (misfit / scale) ** 2)
@@ -133,12 +133,11 @@ class ElasticPull:
 
     operator: csr_matrix
     penalty: Array
-    solver: LinearSolver
+    body: Constrained
 
     def __call__(self, offset: Array) -> Array:
         """Field (n, 3) mm for offsets (q, 3) mm."""
-        force = self.operator.T @ np.einsum("qij,qj->qi", self.penalty, offset)
-        return self.solver.solve(force.ravel()).reshape(-1, 3)
+        return self.body.solve(self.operator.T @ np.einsum("qij,qj->qi", self.penalty, offset))
 
 
 def elastic_pull(mesh: TetMesh, tissue: Tissue, wanted: PointConstraints, model_sigma: float) -> ElasticPull:
@@ -149,9 +148,7 @@ def elastic_pull(mesh: TetMesh, tissue: Tissue, wanted: PointConstraints, model_
     return _pull(mesh, tissue, operator, _penalty(_shape(wanted.normals), stiffness), PULL_TOLERANCE)
 
 
-def _pull(
-    mesh: TetMesh, tissue: Tissue, operator: csr_matrix, penalty: Array, tolerance: float = ONCE_TOLERANCE
-) -> ElasticPull:
+def _pull(mesh: TetMesh, tissue: Tissue, operator: csr_matrix, penalty: Array, tolerance: float) -> ElasticPull:
     matrix, _ = point_constraints(operator, penalty, np.zeros((len(penalty), 3)))
     held = (matrix + diags(anchor(mesh, tissue))).tocsr()
     return ElasticPull(operator, penalty, constrained(mesh, tissue, held, tolerance))
