@@ -27,7 +27,7 @@ from poro.mesh.tetmesh import TetMesh
 REGION_MM3 = 1e5
 REACH_MM = 20.0
 CORRECTION_TOLERANCE, PULL_TOLERANCE = 1e-7, 1e-5
-"""Of the residual; with the second, fields of 3 mm were right to 0.002 mm on blocks, which scatter by half a millimetre."""
+"""Of the residual. With the second, fields of 3 mm were right to 0.002 mm; the blocks they follow scatter by 0.5 mm."""
 KEYPOINT_SHARE = 0.75
 """Of a keypoint's standard deviation in the fit: that holds what few parameters cannot follow too, which the correction
 can. Chosen (1.5 mm beside 2 mm), not derived."""

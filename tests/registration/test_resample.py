@@ -116,6 +116,21 @@ def test_a_displacement_field_of_one_slice_is_linear_along_the_others() -> None:
     assert_allclose(field.displacement(points), [[0, 1, 0], [0, 3, 0], [0, 4, 0]], atol=1e-12)
 
 
+@pytest.mark.parametrize("slices", [1, 7])
+def test_an_image_through_a_field_is_what_it_is_at_the_moved_points_one_by_one(slices: int) -> None:
+    """A field on a turned grid of its own that ends inside the target, and an image that does."""
+    moving = image_of(make_pattern(3), oriented("LAS", (24, 22, 20), 2.0, CENTRE))
+    lattice = tilted(oriented("RAS", (8, 9, slices), 5.0, CENTRE), TILT)
+    vectors = np.random.default_rng(2).normal(0, 4, (*lattice.shape, 3)).astype(np.float32)
+    field = DisplacementField(vectors, lattice.ras_from_ijk)
+    for target in (oriented("RPS", (28, 40, 33), 2.0, CENTRE), lattice):
+        one_by_one = interpolate(moving.hu, moving.grid, field(target.points().reshape(-1, 3)), -1000.0)
+        got = resample(moving, target, field).hu.ravel()
+        assert_allclose(got, one_by_one, atol=1e-3)
+        assert 0.02 < (got == -1000).mean() < 0.9
+        assert np.ptp(got[got > -1000]) > 20
+
+
 def test_a_displacement_field_refuses_scalars() -> None:
     with pytest.raises(ValueError, match=r"\(ni, nj, nk, 3\), got \(2, 2, 2\)"):
         DisplacementField(np.zeros((2, 2, 2)), np.eye(4))
