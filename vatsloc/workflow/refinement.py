@@ -54,7 +54,7 @@ SHALLOW_MM, DEEP_MM = 8.0, 20.0
 WALL_SIGMA_MM, WALL_REACH_MM, WALL_ALONG = 2.0, 5.0, 0.7
 """Standard deviation of where a lung that fills its cavity touches the wall; how far a node of its surface may be off,
 and the least cosine between both normals: beyond, the nearest wall is likelier another one."""
-ROUNDS = 4
+ROUNDS = 3
 """How often a lung is drawn to the same blocks and smoothed: where there are none, what others tell comes nearer by a
 little each time."""
 ANCHOR_SIGMA_MM = 0.2
