@@ -177,7 +177,7 @@ def multigrid(matrix: csr_matrix, points: Array, tolerance: float = 1e-10) -> Mu
 class ForFew:
     """Solver of a matrix as of `linear_solver`, in less time than that takes for one right-hand side or a few.
 
-    quick: None where the matrix is too ill-conditioned for it, or proves to be.
+    quick: None where the matrix is too ill-conditioned for it; where that shows later, an exact factor answers too.
     """
 
     matrix: csr_matrix
