@@ -190,12 +190,18 @@ def test_a_pass_is_followed_that_leaves_hardly_more_at_held_out_blocks(
     assert (found.points == Lung.start).all() != kept
 
 
-@pytest.mark.parametrize(("misfit", "voxels"), [(0.6, [1.5, 1.0]), (0.7, [1.5, 1.5, 1.0])])
-def test_the_same_voxels_serve_once_more_where_held_out_blocks_are_still_missed(
-    misfit: float, voxels: list[float], monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("misfit", "is_cut", "voxels"),
+    [(0.6, False, [1.5, 1.0]), (0.7, False, [1.5, 1.5, 1.0]), (0.6, True, [1.5, 1.5, 1.0])],
+)
+def test_the_same_voxels_serve_once_more_where_held_out_blocks_are_missed_and_in_a_cut_lung(
+    misfit: float, is_cut: bool, voxels: list[float], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "_misfit", lambda *_given: misfit)
-    found = refine_by_blocks(prospect(compared(), Lung.rest, ON), Lung.shape(np.zeros(0, int)))
+    shape = Lung.shape(np.zeros(0, int))
+    if is_cut:
+        shape = replace(shape, cut=lambda points: np.full(len(points), 50.0))
+    found = refine_by_blocks(prospect(compared(), Lung.rest, ON), shape)
     assert [one.voxel_mm for one in found.passes] == voxels
 
 

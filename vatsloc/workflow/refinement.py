@@ -38,7 +38,8 @@ from vatsloc.workflow.smoothed import Smoother, smoother
 PASSES = ((1.5, 6.0), (1.5, 6.0), (1.0, 3.0))
 """Voxels of the blocks and how far they are looked for, mm, pass by pass: more are found where the first ones led."""
 SETTLED_MM = 0.65
-"""Median misfit at held-out blocks below which voxels of one size do not serve for another pass."""
+"""Median misfit at held-out blocks below which voxels of one size do not serve a lung in one piece for another pass.
+Beside a cut, what a pass finds leads on to more."""
 NO_WORSE = 1.02
 """A pass is followed that leaves at most this much more of the misfit at held-out blocks. They judge a lung that
 followed only three quarters of what the answer follows."""
@@ -148,7 +149,7 @@ def refine_by_blocks(prospect: Prospect, shape: Shape) -> BlockRefinement:
     passes: list[Pass] = []
     trial, answer = shape, None
     for lungs, (voxel_mm, reach_mm) in zip(prospect.lungs, PASSES, strict=True):
-        if passes and passes[-1].settled and passes[-1].voxel_mm == voxel_mm:
+        if passes and passes[-1].settled and passes[-1].voxel_mm == voxel_mm and shape.cut is None:
             continue
         back = trial.map.inverse().linearized
         matches = match_aligned(*lungs, starts, back, AlignedSettings(reach_mm))
