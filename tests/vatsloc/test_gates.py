@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from poro.mesh import TetMesh
 from registration.volume import Array, Mask
 from tests.vatsloc import run_scene as known
 from vatsloc.imaging.surface import Border
+from vatsloc.workflow import localization
 from vatsloc.workflow.gates import Gate
 from vatsloc.workflow.model_selection import Refinement
 from vatsloc.workflow.quality import (
@@ -21,7 +23,7 @@ from vatsloc.workflow.quality import (
     surface_percentiles,
     warn_of_unsure_tissue,
 )
-from vatsloc.workflow.settings import GateSettings
+from vatsloc.workflow.settings import GateSettings, Settings
 from vatsloc.workflow.stages import Stages
 
 # What the scene below measures, by gate, and the limit that each one is held against.
@@ -219,7 +221,7 @@ def unsure(mesh: TetMesh, seen: Array, radius_mm: Array) -> list[str]:
     return stages.warnings
 
 
-def test_tissue_near_the_pleura_that_is_badly_known_is_told():
+def test_tissue_near_the_pleura_that_is_badly_known_is_told() -> None:
     mesh = known.ball_mesh(np.zeros(3), 40.0, 10.0)
     near, east = mesh.node_depths <= 10, mesh.points[:, 0]
     order = np.argsort(-east)
@@ -234,3 +236,18 @@ def test_tissue_near_the_pleura_that_is_badly_known_is_told():
     assert not unsure(mesh, ~cap[0.35], np.where(cap[0.35], 17.2, 3.0)), "out of view"
     assert not unsure(mesh, everywhere, np.where(near, 3.0, 99.0)), "deeper than any that cannot be felt"
     assert not unsure(mesh, ~everywhere, np.full(len(east), 99.0)), "none in view"
+
+
+def test_a_run_that_has_checked_itself_tells_it_and_keeps_the_radius(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = known.scene()
+    radius = np.full(len(scene.pose.mesh_ct.points), 40.0)
+    for name, given in {"compare": None, "check_gates": {}, "covariance": np.eye(3)[None], "radius95": radius}.items():
+        monkeypatch.setattr(localization, name, lambda *_asked, given=given: given)
+    monkeypatch.setattr(localization, "Checks", lambda phase1, chain: SimpleNamespace(phase1=phase1, chain=chain))
+    before = localization.Localization(
+        scene.prepared, scene.pose, scene.collapse, known.NODULE_INF, known.NODULE_DEF, np.ones(3), np.eye(3), {}
+    )
+    stages = Stages()
+    found = localization.checked(scene.case, before, Settings(), stages)
+    assert found.radius95_mm is radius
+    assert ["more than 40 mm" in warning for warning in stages.warnings] == [True]
