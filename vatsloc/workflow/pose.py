@@ -144,17 +144,10 @@ def change_of_pose(
     points, refinement = placed.points + extension.u, None
     if settings.refinement.on:
         with stages.stage(REFINEMENT):
-            to_inflated = MeshMap(mesh, points, inf_from_ct_rigid)
-            refinement = refine_by_blocks(
-                stages.done(ready),
-                Shape(
-                    placed,
-                    to_inflated,
-                    np.flatnonzero(seen & (mesh.node_depths > DEEP_MM)),
-                    DEEP_MM,
-                    inflated_surface(lung_inf, prepared.inflated.volume, prepared.inflated.field),
-                ),
-            )
+            anchors = np.flatnonzero(seen & (mesh.node_depths > DEEP_MM))
+            wall = inflated_surface(lung_inf, prepared.inflated.volume, prepared.inflated.field)
+            shape = Shape(placed, MeshMap(mesh, points, inf_from_ct_rigid), anchors, DEEP_MM, wall)
+            refinement = refine_by_blocks(stages.done(ready), shape)
         points = refinement.points
     else:
         stages.skip(REFINEMENT, "switched off in the settings")
